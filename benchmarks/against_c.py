@@ -76,7 +76,7 @@ def batch(metrics: bool) -> None:
         def one(trial):
             return montecarlo.one(parts, dispersion, np.uint32(0), trial)[0].peak_torque
 
-        return montecarlo.over_devices(lambda mine: montecarlo.blocks(one, mine), trials, devices)
+        return montecarlo.map_over_devices(lambda mine: montecarlo.map_in_blocks(one, mine), trials, devices)
 
     def ours(ready):
         if metrics:

@@ -45,7 +45,7 @@ def loop(parts, x0):
 
     def period(carry, now: Ticks):
         x, seen, d_hat, u, dt_before, most = carry
-        impulse = watch.model.unexplained_impulse(now.t, seen, x, u, dt_before)
+        impulse = watch.model.implied_disturbance_impulse(now.t, seen, x, u, dt_before)
         updated = watch.update(matrix, d_hat, impulse, now.t, dt_before)
         d_hat = jnp.where(dt_before > 0.0, updated, d_hat)
         u, *_ = law(Sample(now.t, now.hold, parts.period), x, parts.reference(now.t), d_hat, k2(now.t))

@@ -82,7 +82,7 @@ def main() -> None:
         x, d_hat = y
         u, *_ = law(Sample(t, hold, jnp.zeros(())), x, parts.reference(t), d_hat, k2(t))
         x_dot = plant.rate(t, x, u, parts.disturbance(t, x))
-        seen = watch.model.unexplained(t, x, x_dot, u)
+        seen = watch.model.implied_disturbance(t, x, x_dot, u)
         return x_dot, watch.forcing(t, (t, t), d_hat, seen) - watch.decay_matrix(t, t) @ d_hat
 
     @partial(jax.jit, static_argnames="solver")

@@ -31,7 +31,7 @@ def compared(name: str, count: int) -> None:
     begin = time.perf_counter()
     made = folder.Controller(scenario.reading.complete(scenario.from_tables(FLIGHTS[name])), "flight", name)
     with tempfile.TemporaryDirectory() as place:
-        store.write(Path(place) / "c", lambda making: folder.write_program(making, made))
+        store.write_folder(Path(place) / "c", lambda making: folder.write_program(making, made))
         generated = time.perf_counter() - begin
         library, single = (Library(Path(place) / "c", real) for real in ("double", "float"))
     dispersion = vectors.with_nominal_reference(made.ready.dispersion)
@@ -41,8 +41,8 @@ def compared(name: str, count: int) -> None:
     given = np.empty((0, 0))
     at = library.columns["out"].index("command[0]")
     for k in range(count):
-        samples = vectors.one(simulated, k)
-        if not vectors.usable(samples):
+        samples = vectors.single_trial(simulated, k)
+        if not vectors.is_usable(samples):
             continue
         used += 1
         given, out, _ = vectors.rows(made.board, samples)
@@ -50,18 +50,18 @@ def compared(name: str, count: int) -> None:
         expected = out[:, at : at + samples.command.shape[1]]
         found = np.empty_like(expected)
         for n, row in enumerate(given):
-            state, outputs, _ = library.many(state, row)
+            state, outputs, _ = library.step_many(state, row)
             found[n] = outputs[at : at + expected.shape[1]]
         off = np.linalg.norm(found - expected, axis=1)
         size = np.linalg.norm(expected, axis=1)
         assert np.all(np.isfinite(found)), name
         worst = max(worst, float(np.max(off / np.maximum(size, 1e-300))))
         worst_of_peak = max(worst_of_peak, float(np.max(off) / np.max(size)))
-    many = np.repeat(library.first()[None], 100_000, axis=0), np.repeat(given[:1], 100_000, axis=0)
+    many = np.repeat(library.initial_state()[None], 100_000, axis=0), np.repeat(given[:1], 100_000, axis=0)
     seconds = []
     for _ in range(7):
         begin = time.perf_counter()
-        library.many(*many)
+        library.step_many(*many)
         seconds.append((time.perf_counter() - begin) / 100_000)
     print(
         f"| {name} | {used} of {count} | {worst:.1e} | {worst_of_peak:.1e} | {1e6 * np.median(seconds):.2f} us "
@@ -85,7 +85,7 @@ def single_precision(ready: Any, library: Any, count: int) -> str:
         return jax.vmap(one)(trials)
 
     trials, said = jnp.arange(count, dtype=jnp.uint32), []
-    for software in (rollout.OURS, InTheLoop(library, ready.parts).software):
+    for software in (rollout.PYTHON_SOFTWARE, InTheLoop(library, ready.parts).software):
         status, error, peak = (np.asarray(v) for v in fly(trials, software))
         simulated = np.isin(status, rollout.FINISHED)
         said.append((np.sqrt(np.mean(error[simulated] ** 2)), np.mean(peak[simulated]), int(simulated.sum())))

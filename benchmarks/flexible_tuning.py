@@ -31,12 +31,12 @@ def main() -> None:
     found = {"the scenario's": {}}
     for name, one in (("tuned rigid", rigid), ("tuned flexible", loaded)):
         started = time.monotonic()
-        found[name] = tuner.tune(one, 0, trusted=False).gains
+        found[name] = tuner.tune(one, 0, with_checks=False).gains
         said = ", ".join(f"{key} {value:.4g}" for key, value in found[name].items())
         print(f"{name} ({time.monotonic() - started:.0f} s): {said}", flush=True)
     for name, chosen in found.items():
         made = gains.in_scenario(loaded, chosen) if chosen else loaded
-        simulated = judging.judge(made, judging.seed_of_judge(0))
+        simulated = judging.judge(made, judging.derive_held_out_seed(0))
         done, metrics = simulated.finished, simulated.metrics
         print(
             f"{name} on the flexible body: {done.sum()} of {done.size} runs complete, "
@@ -45,7 +45,7 @@ def main() -> None:
             f"largest residual_modal {metrics.residual_modal[done].max():.3e}"
         )
         for truth, body in (("flexible", made), ("rigid", scenario.replace(made, flexible=None))):
-            for where, margins in (stability.worst(scenario.study(body)) or {}).items():
+            for where, margins in (stability.worst_margins(scenario.study(body)) or {}).items():
                 print(
                     f"    {truth} loop, {where}: "
                     + ", ".join(f"{k} {v:.3g}" for k, v in margins.items() if v is not None)

@@ -57,7 +57,7 @@ def everything(problem: Problem):
     def one(trial):
         return montecarlo.one(problem.parts, problem.dispersion, problem.seed, trial)[0]
 
-    return montecarlo.blocks(one, problem.trials)
+    return montecarlo.map_in_blocks(one, problem.trials)
 
 
 def ratios() -> None:

@@ -36,9 +36,9 @@ def main() -> None:
     print("| model | RMS terminal error | RMS window error | largest torque [N m] | complete trials |", flush=True)
     for name, model in (("true", true), ("identified", results.identified(found)), ("20 % off", off)):
         started = time.monotonic()
-        tuned = gains.in_scenario(model, tuner.tune(model, 0, trusted=False).gains)
+        tuned = gains.in_scenario(model, tuner.tune(model, 0, with_checks=False).gains)
         on_body = scenario.replace(tuned, spacecraft__true_inertia=body, dispersion__inertia=None)
-        simulated = judging.judge(on_body, judging.seed_of_judge(0))
+        simulated = judging.judge(on_body, judging.derive_held_out_seed(0))
         done, metrics = simulated.finished, simulated.metrics
         rms = [np.sqrt(np.mean(v[done] ** 2)) for v in (metrics.terminal_error, metrics.window_error)]
         print(f"| {name} | {rms[0]:.4g} | {rms[1]:.4g} | {metrics.peak_torque[done].max():.4f} | "

@@ -27,7 +27,7 @@ def main() -> None:
     for name, one in sets.items():
         for sampling in ("explicit", "implicit"):
             simulated = scenario.replace(one, controller__sampling=sampling)
-            trials = judging.judge(simulated, judging.seed_of_judge(0))
+            trials = judging.judge(simulated, judging.derive_held_out_seed(0))
             errors, peaks, chattering = (
                 np.asarray(getattr(trials.metrics, key)) for key in ("window_error", "peak_torque", "chattering")
             )

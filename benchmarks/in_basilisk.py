@@ -159,7 +159,7 @@ def main() -> None:
     for name, gains in (("published", {}), ("tuned", TUNED)):
         made = folder.Controller(scenario.replace(flight, **gains), "flight", name)
         with tempfile.TemporaryDirectory() as place:
-            store.write(Path(place) / "c", lambda making, made=made: folder.write_program(making, made))
+            store.write_folder(Path(place) / "c", lambda making, made=made: folder.write_program(making, made))
             library = Library(Path(place) / "c")
             subprocess.run(["make", "-C", f"{place}/c", "shared"], check=True, stdout=subprocess.DEVNULL)
             flight_computer = runpy.run_path(f"{place}/c/basilisk.py")["FlightComputer"]

@@ -28,11 +28,11 @@ def tuned(name: str, seed: int, trials: int | None, half: str | None, *, globall
     scenario = replace(read(HERE / f"{name}.toml"), tune={} if trials is None else {"trials": trials})
     if half is not None:
         required = scenario.requirements[half]
-        in_full = parsing.plain(required) if isinstance(required, Limit) else {"limit": required}
+        in_full = parsing.to_dict(required) if isinstance(required, Limit) else {"limit": required}
         limit = {**in_full, "limit": 0.5 * in_full["limit"]}
         scenario = replace(scenario, **{f"requirements__{half}": limit})
     begun = time.monotonic()
-    found = tuner.tune(scenario, seed, globally=globally)
+    found = tuner.tune(scenario, seed, with_global_check=globally)
     errors = found.held_out["tuned"].metrics.window_error[found.held_out["tuned"].finished]
     rms = float((errors**2).mean() ** 0.5) if errors.size else None
     bound = found.lower_bounds["tuned"]

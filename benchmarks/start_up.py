@@ -56,7 +56,7 @@ def compiling() -> None:
     from ptsmc_jax import scenario
     from ptsmc_jax.campaigns import montecarlo
     from ptsmc_jax.simulation import rollout
-    from ptsmc_jax.simulation.computer import OURS
+    from ptsmc_jax.simulation.computer import PYTHON_SOFTWARE
 
     devices = {f"torque_{name}": value for name, value in (("limit", 0.5), ("rate_limit", 5.0), ("lag", 0.1))}
     every = {f"hardware__{k}": v for k, v in {**devices, "delay": 1, "torque_step": 1e-4, "rate_bias": 1e-6}.items()}
@@ -64,7 +64,7 @@ def compiling() -> None:
     cases = {"noise off": study(), "noise on": study(True), "every device": study(True, **every), "hard flight": hard}
     for name, ready in cases.items():
         trials = jnp.arange(512, dtype=jnp.uint32).reshape(2, -1, montecarlo.BLOCK)
-        batch = (ready.parts, ready.dispersion, jnp.uint32(0), trials, jnp.int32(2), 2, None, False, OURS)
+        batch = (ready.parts, ready.dispersion, jnp.uint32(0), trials, jnp.int32(2), 2, None, False, PYTHON_SOFTWARE)
         for what, function, args in (("batch", montecarlo._simulate_rows, batch), ("one run", rollout.simulate_parts,
                                                                          (ready.parts, 0, 0))):  # fmt: skip
             start = time.perf_counter()

@@ -54,30 +54,32 @@ def variants() -> dict[str, Callable]:
     class AllTheWay(everything):
         """A search without successive halving: every local search has half of the steps."""
 
-        def _successive_halving(self, problem, starts, stages, what, **others):
-            stages = ((len(starts), max(2, self._steps // 2)),) if what == "searching" else stages
-            return super()._successive_halving(problem, starts, stages, what, **others)
+        def _successive_halving(self, problem, starts, stages, step_name, **others):
+            stages = ((len(starts), max(2, self._steps // 2)),) if step_name == "searching" else stages
+            return super()._successive_halving(problem, starts, stages, step_name, **others)
 
     class Evolved(everything):
         """Differential evolution after the local searches."""
 
         def search_locally(self, problem, starts):
             super().search_locally(problem, starts)
-            self.evolve(problem, self.normalised, evolution.NEARBY)
+            self.evolve(problem, self.normalised, evolution.NEAR_BEST)
 
     def searching(kind: type) -> Callable:
         return lambda: changed(optimise, LocalSearches=kind)
 
     return {
         "as it is": lambda: changed(local_searches),
-        "all trials from the start": lambda: changed(local_searches, AVERAGED=10**6),
+        "all trials from the start": lambda: changed(local_searches, FEWEST_AVERAGED=10**6),
         "without a race": searching(AllTheWay),
-        "starts drawn, not chosen": lambda: changed(starts, promising=lambda _, __, share, count, ___: share[:count]),
-        "chosen by merit alone": lambda: changed(starts, APART=(0.0,)),
-        "nothing held in the sweep": lambda: changed(starts, held_by_limits=lambda _: []),
+        "starts drawn, not chosen": lambda: changed(
+            starts, choose_promising=lambda _, __, share, count, ___: share[:count]
+        ),
+        "chosen by merit alone": lambda: changed(starts, DISTANCES=(0.0,)),
+        "nothing held in the sweep": lambda: changed(starts, find_decisive_gains=lambda _: []),
         "careful steps only": lambda: changed(local_searches, BOLD=local_searches.CAREFUL),
         "bold steps only": lambda: changed(local_searches, CAREFUL=local_searches.BOLD),
-        "off samples": lambda: changed(hand_overs, on_samples=lambda *_: []),
+        "off samples": lambda: changed(hand_overs, points_on_samples=lambda *_: []),
         "evolution added": searching(Evolved),
     }
 
@@ -104,7 +106,7 @@ def main() -> None:
         loaded = scenario.from_tables(CHAIN) if name == "chain" else scenario.read(SCENARIOS / f"{FILES[name]}.toml")
         table = loaded.tune
         assert table is not None
-        posed = posing.tuning_problem(loaded, 0)
+        posed = posing.set_up_tuning(loaded, 0)
         evaluate = posed.evaluate
         for seed in range(seeds):
             for variant, inside in variants().items():

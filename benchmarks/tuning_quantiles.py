@@ -71,7 +71,7 @@ def main() -> None:
         loaded = scenario.from_tables({**tables, "tune": TUNE})
         for seed in range(seeds):
             started = time.monotonic()
-            found = tuner.tune(loaded, seed, trusted=False, tries=1)
+            found = tuner.tune(loaded, seed, with_checks=False, tries=1)
             search = found.search
             training = bool((search.worst <= 1.0).all()) and all(one.confirmed for one in search.counts)
             fresh = all(verdict.met for verdict in found.verdicts)

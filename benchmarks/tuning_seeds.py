@@ -23,11 +23,11 @@ def held_out_trials(loaded, names, values) -> str:
     made = gains.in_scenario(loaded, dict(zip(names, values.tolist(), strict=True)))
     rms, above, off, peaks = [], [], [], []
     for seed in range(3):
-        simulated = judging.judge(made, judging.seed_of_judge(seed))
+        simulated = judging.judge(made, judging.derive_held_out_seed(seed))
         squares = simulated.metrics.window_error[simulated.finished] ** 2
         rms.append(float(np.sqrt(squares.mean())))
         error = squares.std() / np.sqrt(squares.size) / (2 * rms[-1])  # 1 sigma of the RMS
-        bound = judging.rms_lower_bound(made, judging.seed_of_judge(seed))
+        bound = judging.rms_lower_bound(made, judging.derive_held_out_seed(seed))
         if bound:
             above.append(rms[-1] / bound)
             off.append((rms[-1] - bound) / error)
@@ -55,7 +55,7 @@ def main() -> None:
         loaded = scenario.replace(loaded, tune__free=sys.argv[3].split(","), tune__bounds=None)
     table = loaded.tune
     assert table is not None
-    posed = posing.tuning_problem(loaded, 0)
+    posed = posing.set_up_tuning(loaded, 0)
     ready, problem, evaluate, scenario_gains, found = (
         posed.ready,
         posed.problem,
@@ -89,7 +89,7 @@ def main() -> None:
         near = [one.value <= 1.01 * reference for one in found]
         print(f"within 1 % of {name}: {sum(near)} of {len(near)}; "
               f"largest distance {100 * (max(one.value for one in found) / reference - 1):+.2f} %")  # fmt: skip
-    fresh = judging.seed_of_judge(0)
+    fresh = judging.derive_held_out_seed(0)
     paper = judging.judge(gains.published_scenario(loaded), fresh)
     named = dict(zip(problem.names, best.gains.tolist(), strict=True))
     tuned = judging.judge(gains.in_scenario(loaded, named), fresh)

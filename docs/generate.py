@@ -105,7 +105,7 @@ def scenarios() -> str:
                 default = " (default)" if kind == first else ""
                 said = f'`kind = "{kind}"`{default}: ' if kind else ""
                 said = f'`kind = "{plant}"`: ' if name == "plant" else said
-                parts += [said + keys.about(struct), *_keys(name, struct, plant)]
+                parts += [said + keys.description(struct), *_keys(name, struct, plant)]
             known: dict[str, list[str]] = {}
             for kind, struct in kinds.items():
                 if struct in seen:
@@ -118,7 +118,7 @@ def scenarios() -> str:
             if name == "sensors" and plant == "spacecraft":
                 parts += ["### [[sensors]]", SUITE]
                 for kind, struct in sensor_tables.SENSORS.items():
-                    parts += [f'`kind = "{kind}"`: {keys.about(struct)}', *_keys(name, struct, plant)]
+                    parts += [f'`kind = "{kind}"`: {keys.description(struct)}', *_keys(name, struct, plant)]
         if plant == "spacecraft":
             parts += ["### [requirements]", REQUIREMENTS, *_keys("requirements", Limit, plant)]
         else:
@@ -179,7 +179,7 @@ def _keys(table: str, struct: type[Table], plant: str) -> Iterator[str]:
 def _case_i(plant: str) -> Mapping[str, Mapping[str, Any]]:
     """Return the defaults of a plant with the paper's law that are not defaults of single keys."""
     made = layouts.SCENARIOS[plant]
-    return made.fallback(typing.cast(type[Table], made.TABLES["plant"])(), (), "prescribed_time")
+    return made.plant_defaults(typing.cast(type[Table], made.TABLES["plant"])(), (), "prescribed_time")
 
 
 def _dispersion(struct: type[Table], unit_of_d: str) -> Iterator[str]:
@@ -194,7 +194,7 @@ def _kinds(key: keys.Key, kinds: Kinds, unit_of_d: str = keys.UNIT_OF_D) -> Iter
         for k in keys.list_keys(struct, unit_of_d):
             said = [f"default {shown}" if (shown := _default(k.default)) else "", k.text]
             given.append(f"`{k.name}`: {', '.join(filter(None, said))}")
-        yield [f"`{key.name}`", key.meaning, "; ".join(given), keys.about(struct)]
+        yield [f"`{key.name}`", key.meaning, "; ".join(given), keys.description(struct)]
 
 
 def _shown(key: keys.Key, struct: type[Table], fallback: Mapping[str, Any]) -> str:

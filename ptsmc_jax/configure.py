@@ -47,7 +47,10 @@ OPTIONS = (
     _Option("--xla_backend_optimization_level=1", on_gpu=False),
     _Option("--xla_cpu_use_fusion_emitters=false", jaxlib=("0.10",), on_gpu=False),
 )
-_DECISIVE = ("--xla_backend_extra_options", "--xla_disable_hlo_passes")  # no options are set if the user sets one
+_EXCLUSIVE_FLAGS = (
+    "--xla_backend_extra_options",
+    "--xla_disable_hlo_passes",
+)  # no options are set if the user sets one
 
 programs: Path | None = None  # folder of stored programs, see `ptsmc_jax.programs`; None: do not store any
 for_command = False  # argument `keep_programs` of the last call; custom code does not change it
@@ -115,13 +118,13 @@ def configure(
     if device is not None:  # "gpu" would require a GPU of every maker; JAX itself finds the GPU of this machine
         jax.config.update("jax_platforms", "cpu" if device == "cpu" else None)
     try:
-        jax.config.update("jax_num_cpu_devices", devices or _cores())
+        jax.config.update("jax_num_cpu_devices", devices or _count_cores())
     except RuntimeError:
         raise RuntimeError(
             "configure() comes too late: JAX has already run something in this process, on other devices; call it "
             "first, right after the imports"
         ) from None
-    folder = _usable(_cache_folder() if cache == "default" else cache)
+    folder = _check_cache_folder(_default_cache_folder() if cache == "default" else cache)
     for_command = keep_programs
     programs = folder / "programs" if keep_programs and folder is not None else None
     if folder is not None:
@@ -135,9 +138,9 @@ def configure(
 
 def _set_compiler_options(fast: bool, device: str | None) -> None:
     """Set XLA_FLAGS; raise RuntimeError if JAX has already started with others."""
-    before = os.environ.get("XLA_FLAGS", "")
-    new_flags = _flags(before, _options(device) if fast else ())
-    if sorted(new_flags.split()) == sorted(before.split()):
+    old_flags = os.environ.get("XLA_FLAGS", "")
+    new_flags = _merge_flags(old_flags, _compiler_options(device) if fast else ())
+    if sorted(new_flags.split()) == sorted(old_flags.split()):
         return
     if _has_started():
         raise RuntimeError(
@@ -147,7 +150,7 @@ def _set_compiler_options(fast: bool, device: str | None) -> None:
     os.environ["XLA_FLAGS"] = new_flags
 
 
-def _options(device: str | None) -> tuple[str, ...]:
+def _compiler_options(device: str | None) -> tuple[str, ...]:
     """Return the options for this version, machine and device; None: a GPU may be used if a plug-in is installed."""
     options = _known_options(device == "cpu" or (device is None and importlib.util.find_spec("jax_plugins") is None))
     if not options:
@@ -162,27 +165,30 @@ def _known_options(on_cpu: bool) -> tuple[str, ...]:
     return tuple(option.text for option in known if on_cpu or option.on_gpu)
 
 
-def _flags(before: str, options: tuple[str, ...]) -> str:
+def _merge_flags(old_flags: str, options: tuple[str, ...]) -> str:
     """Return XLA_FLAGS with these options, and without those of an earlier call or of the process that began this one.
 
     The user's options take precedence. If XLA_FLAGS is the name of a file, it is returned unchanged.
     """
-    if before.strip() and not before.lstrip().startswith("-"):
-        return before
-    flags, ours = before.split(), {flag for on_cpu in (True, False) for flag in _as_flags(_known_options(on_cpu))}
-    if any(flag in ours for flag in flags if flag.startswith(_DECISIVE[0])):  # unique: ours have been added
-        flags = [flag for flag in flags if flag not in ours]
+    if old_flags.strip() and not old_flags.lstrip().startswith("-"):
+        return old_flags
+    flags, our_flags = (
+        old_flags.split(),
+        {flag for on_cpu in (True, False) for flag in _format_flags(_known_options(on_cpu))},
+    )
+    if any(flag in our_flags for flag in flags if flag.startswith(_EXCLUSIVE_FLAGS[0])):  # unique: ours have been added
+        flags = [flag for flag in flags if flag not in our_flags]
     names = {flag.split("=")[0] for flag in flags}
-    if names.isdisjoint(_DECISIVE):
-        flags += [flag for flag in _as_flags(options) if flag.split("=")[0] not in names]
+    if names.isdisjoint(_EXCLUSIVE_FLAGS):
+        flags += [flag for flag in _format_flags(options) if flag.split("=")[0] not in names]
     return " ".join(flags)
 
 
-def _as_flags(options: tuple[str, ...]) -> list[str]:
+def _format_flags(options: tuple[str, ...]) -> list[str]:
     """Return the options as flags of XLA."""
-    extra = ",".join(option for option in options if not option.startswith("--"))
-    plain = [option for option in options if option.startswith("--")]
-    return [f"{_DECISIVE[0]}={extra}", *plain] if extra else plain
+    backend_options = ",".join(option for option in options if not option.startswith("--"))
+    xla_flags = [option for option in options if option.startswith("--")]
+    return [f"{_EXCLUSIVE_FLAGS[0]}={backend_options}", *xla_flags] if backend_options else xla_flags
 
 
 def _has_started() -> bool:
@@ -198,7 +204,7 @@ def _has_started() -> bool:
     return False
 
 
-def _usable(cache: str | Path | None) -> Path | None:
+def _check_cache_folder(cache: str | Path | None) -> Path | None:
     """Return the folder of the compile cache, made if it is missing, or None with a warning if it is not safe.
 
     Loading an entry runs machine code, so the folder must belong to the user, and other users must not write it.
@@ -255,7 +261,7 @@ def processors() -> list:
         return jax.local_devices()
 
 
-def warn_if_forgotten() -> None:
+def warn_if_not_configured() -> None:
     """Warn once if numbers have 32 bits although `configure` was not called."""
     import jax
 
@@ -270,25 +276,25 @@ def warn_if_forgotten() -> None:
         )
 
 
-def _cores() -> int:
+def _count_cores() -> int:
     """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _cache_folder() -> Path | None:
+def _default_cache_folder() -> Path | None:
     """Return the folder of this processor's compiled code, or None for a user without a home."""
     try:
         base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     except RuntimeError:  # as in a container with an unknown user
         return None
-    return Path(base) / "ptsmc-jax" / hashlib.sha256(_processor().encode()).hexdigest()[:12]
+    return Path(base) / "ptsmc-jax" / hashlib.sha256(_describe_processor().encode()).hexdigest()[:12]
 
 
-def _processor() -> str:
+def _describe_processor() -> str:
     """Describe the processor: code compiled for one must not be loaded on another."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        described = sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))})
+        properties = sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))})
     except OSError:
-        described = [platform.processor()]
-    return "\n".join([platform.machine(), *described])
+        properties = [platform.processor()]
+    return "\n".join([platform.machine(), *properties])

@@ -80,20 +80,20 @@ class Declaration(NamedTuple):
 
     def type(self, body: bool) -> Any:
         """Return the type that `msgspec` checks; body: the plant is a spacecraft, with three inputs."""
-        one = Annotated[float, self.limits.meta(self.words)]
+        number_type = Annotated[float, self.limits.meta(self.words)]
         value = self.default.value if isinstance(self.default, Scaled) else self.default
         if not self.each and not isinstance(value, tuple):
-            return one
+            return number_type
         words = self.limits.words(several=True)
         if self.any_length:
-            return Annotated[tuple[one, ...], Meta(description=self.allowed, min_length=1)]
+            return Annotated[tuple[number_type, ...], Meta(description=self.allowed, min_length=1)]
         if not self.each:
             size = len(value)
             description = f"{'three' if size == 3 else f'a list of {size}'} numbers{words}"
-            return Annotated[tuple[one, ...], Meta(description=description, min_length=size, max_length=size)]
+            return Annotated[tuple[number_type, ...], Meta(description=description, min_length=size, max_length=size)]
         if body:
-            return Annotated[tuple[one, one, one], Meta(description=f"three numbers{words}")]
-        return Annotated[tuple[one, ...], Meta(description=f"a list of numbers{words}, one for each input")]
+            return Annotated[tuple[number_type, number_type, number_type], Meta(description=f"three numbers{words}")]
+        return Annotated[tuple[number_type, ...], Meta(description=f"a list of numbers{words}, one for each input")]
 
 
 def number(
@@ -126,7 +126,7 @@ def number(
         kw_only: as for `dataclasses.field`.
     """
     limits = Limits(above, below, at_least, at_most)
-    return _field(Declaration(default, meaning, unit, limits, each, any_length, allowed), kw_only=kw_only)
+    return _make_field(Declaration(default, meaning, unit, limits, each, any_length, allowed), kw_only=kw_only)
 
 
 def gain(
@@ -162,10 +162,10 @@ def gain(
         free: whether tuning moves it by default; "sampled": in the sampled loop only.
     """
     limits = Limits(-math.inf if math.isfinite(at_least) else above, below, at_least, at_most)
-    return _field(Declaration(default, meaning, unit, limits, each, False, allowed, True, usual, free))
+    return _make_field(Declaration(default, meaning, unit, limits, each, False, allowed, True, usual, free))
 
 
-def _field(declared: Declaration, **options: Any) -> Any:
+def _make_field(declared: Declaration, **options: Any) -> Any:
     """Return the dataclass field. It has a default if that is a number or numbers, in the published case."""
     value = declared.default.value if isinstance(declared.default, Scaled) else declared.default
     options["metadata"] = {"declared": declared}
@@ -175,13 +175,13 @@ def _field(declared: Declaration, **options: Any) -> Any:
 
 
 def declared(cls: type) -> dict[str, Declaration]:
-    """Return what a class declares of its fields, by their names."""
-    found = {field.name: field.metadata.get("declared") for field in dataclasses.fields(cls)}
-    return {name: one for name, one in found.items() if one is not None}
+    """Return the declarations of the fields of a class, by field name."""
+    declarations = {field.name: field.metadata.get("declared") for field in dataclasses.fields(cls)}
+    return {name: declaration for name, declaration in declarations.items() if declaration is not None}
 
 
 class Tunable:
-    """The base of parts that may have gains: their names are known from the declarations."""
+    """Base class of parts that may have gains; it collects the names of the gains from the declarations."""
 
     tunable: ClassVar[tuple[str, ...]] = ()  # gains that tuning may move
 

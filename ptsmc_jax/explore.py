@@ -25,7 +25,7 @@ from ptsmc_jax.onboard.library import InTheLoop, Library
 from ptsmc_jax.scenario import Study, parsing, reading
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
-from ptsmc_jax.simulation.computer import OURS, Software
+from ptsmc_jax.simulation.computer import PYTHON_SOFTWARE, Software
 from ptsmc_jax.simulation.requirements import Verdict
 from ptsmc_jax.theory.lower_bound import LowerBound
 
@@ -57,11 +57,11 @@ class Quantities(Mapping[str, float]):
 def html_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return an HTML table with these cells, which are escaped."""
 
-    def line(cells: Sequence[str], tag: str) -> str:
+    def html_row(cells: Sequence[str], tag: str) -> str:
         return "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"
 
-    body = "".join(line(cells, "td") for cells in rows)
-    return f"<table><thead>{line(head, 'th')}</thead><tbody>{body}</tbody></table>"
+    body = "".join(html_row(cells, "td") for cells in rows)
+    return f"<table><thead>{html_row(head, 'th')}</thead><tbody>{body}</tbody></table>"
 
 
 def html_list(lines: Iterable[object]) -> str:
@@ -127,11 +127,11 @@ class Simulation:
 
     def animate(self, frames: int = 40) -> "animation.Animation":
         """Animate the rotation of the body to its reference in 3D; raise ValueError if the plant is no spacecraft."""
-        return animation.of_run(self.run.parts, self.run.log, frames)
+        return animation.animate_run(self.run.parts, self.run.log, frames)
 
     def to_polars(self) -> pl.DataFrame:
         """Return the history, one row per sample: t [s], state, estimate, delivered torque, sliding variable, error."""
-        return pl.DataFrame({**self.run.columns(), **runs.numbered("error", self.run.log.error)})
+        return pl.DataFrame({**self.run.columns(), **runs.numbered_columns("error", self.run.log.error)})
 
     def __repr__(self) -> str:
         return "\n".join([self._ending(), repr(self.metrics), *map(str, self.verdicts)])
@@ -140,8 +140,8 @@ class Simulation:
         return f"<p>{html.escape(self._ending())}</p>{self.metrics._repr_html_()}{html_list(self.verdicts)}"
 
     def _ending(self) -> str:
-        why = f", {self.run.reason}, at {self.run.bad_time:.4g} s" if self.run.reason else ""
-        return f"status: {self.status}{why}"
+        failure = f", {self.run.reason}, at {self.run.bad_time:.4g} s" if self.run.reason else ""
+        return f"status: {self.status}{failure}"
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,7 @@ class Identified(estimation.Identification):
 
     def plot(self, *names: str) -> "Figures":
         """Return all figures of the identification, or the named ones; raise ValueError for an unknown name."""
-        return Figures(identification_plots.figures_of(self)).only(names)
+        return Figures(identification_plots.identification_figures(self)).only(names)
 
     def __repr__(self) -> str:
         return "\n".join([*self.verdict, super().__repr__()])
@@ -216,9 +216,9 @@ def simulate(
     """
     draws.check_whole_number("seed", seed)
     draws.check_whole_number("trial", 0 if trial is None else trial)
-    loaded = _read(what) if controller is None else folder.on_flight_clock(_read(what))
+    loaded = _to_scenario(what) if controller is None else folder.on_flight_clock(_to_scenario(what))
     ready = scenario.study(loaded, drawn=trial is not None)
-    return Simulation(loaded, runs.simulate(ready, seed, trial, _software(controller, ready)))
+    return Simulation(loaded, runs.simulate(ready, seed, trial, _flight_software(controller, ready)))
 
 
 def trials(
@@ -251,33 +251,35 @@ def trials(
             number nor a table.
     """
     draws.check_whole_number("seed", seed)
-    ready = _ready(what if controller is None else folder.on_flight_clock(_read(what)))
-    software = _software(controller, ready)
-    drawn = campaign.Campaign(ready, seed, custom_metrics, software=software)
+    ready = _to_study(what if controller is None else folder.on_flight_clock(_to_scenario(what)))
+    software = _flight_software(controller, ready)
+    trial_campaign = campaign.Campaign(ready, seed, custom_metrics, software=software)
     try:
-        names = drawn.custom_metric_names()
+        metric_names = trial_campaign.custom_metric_names()
     except ValueError as error:
         raise ValueError(
             f"custom_metrics is {getattr(custom_metrics, '__name__', type(custom_metrics).__name__)}: {error}"
         ) from None
     if isinstance(count, pl.DataFrame):
-        table = run_tables.checked(count, ready.parts, custom_metrics=names, drawn=ready.dispersion.custom_names())
-        drawn = replace(campaign.of_run_table(ready, seed, table, custom_metrics), software=software)
+        table = run_tables.check_table(
+            count, ready.parts, custom_metrics=metric_names, drawn=ready.dispersion.custom_names()
+        )
+        trial_campaign = replace(campaign.from_run_table(ready, seed, table, custom_metrics), software=software)
         count = table.count
     if np.ndim(count) or np.asarray(count).dtype == object:
         allowed = "a whole number, or a polars table with a row for each trial"
         raise ValueError(f"count is a {type(count).__name__}, but must be {allowed}")
     draws.check_whole_number("count", count, 1)
-    return drawn.simulate(range(count))
+    return trial_campaign.simulate(range(count))
 
 
-def _software(controller: str | Path | None, ready: Study) -> Software:
+def _flight_software(controller: str | Path | None, ready: Study) -> Software:
     """Return the flight software: the C code of a folder, or the code of the parts.
 
     Warn about differences between the C code and the scenario.
     """
     if controller is None:
-        return OURS
+        return PYTHON_SOFTWARE
     computer = InTheLoop(Library(controller), ready.parts, ready.dispersion)
     if computer.parameter_differences:
         warnings.warn(computer.parameter_differences, RuntimeWarning, stacklevel=3)
@@ -292,15 +294,15 @@ def lower_bound(what: Scenario | Study | str | Path, *, seed: int = 0) -> float 
     The bound is 0 if nothing is unknown, and None if no trial is complete or if the sensors are custom.
     """
     draws.check_whole_number("seed", seed)
-    return runs.rms_lower_bound(_ready(what), seed)
+    return runs.rms_lower_bound(_to_study(what), seed)
 
 
-def _read(what: Scenario | Study | str | Path) -> Scenario:
+def _to_scenario(what: Scenario | Study | str | Path) -> Scenario:
     return reading.to_scenario(what.scenario if isinstance(what, Study) else what)
 
 
-def _ready(what: Scenario | Study | str | Path) -> Study:
-    return what if isinstance(what, Study) else scenario.study(_read(what))
+def _to_study(what: Scenario | Study | str | Path) -> Study:
+    return what if isinstance(what, Study) else scenario.study(_to_scenario(what))
 
 
 def verdicts(what: Scenario | Study | str | Path, rows: pl.DataFrame, *, seed: int = 0) -> list[Verdict]:
@@ -323,14 +325,14 @@ def verdicts(what: Scenario | Study | str | Path, rows: pl.DataFrame, *, seed: i
         raise TypeError(
             f"rows are needed in a polars DataFrame, as trials returns them, but this is a {type(rows).__name__}"
         )
-    loaded = _read(what)
-    asked = scenario.requirements(loaded)
-    needed = ["status", *(name for r in asked for name in (r.metric, r.timed) if name is not None)]
+    loaded = _to_scenario(what)
+    required = scenario.requirements(loaded)
+    needed = ["status", *(name for r in required for name in (r.metric, r.timed) if name is not None)]
     missing = [name for name in needed if name not in rows.columns]
     if missing or not rows.height:
         raise ValueError(f"the rows have no {missing[0]}" if missing else "there are no rows, but must be one at least")
-    of_margins = margin_verdicts.of_trials(_ready(what), seed) if scenario.margin_requirements(loaded) else []
-    return [*campaign.verdicts(asked, rows), *of_margins]
+    on_margins = margin_verdicts.judge_trials(_to_study(what), seed) if scenario.margin_requirements(loaded) else []
+    return [*campaign.verdicts(required, rows), *on_margins]
 
 
 def identify(
@@ -357,12 +359,12 @@ def identify(
         ScenarioError: a parameter is unknown.
         RefusedError: a log cannot be used; the sentence names row and column.
     """
-    loaded = reading.complete(_read(what))
+    loaded = reading.complete(_to_scenario(what))
     frames = [*([log] if isinstance(log, pl.DataFrame) else log), *validate]
     logs = [telemetry.measurements(loaded, frame, f"log {k + 1}") for k, frame in enumerate(frames)]
     used = len(logs) - len(validate)
-    found = estimation.of_logs(loaded, logs[:used], logs[used:], free, report)
-    return Identified(**{field.name: getattr(found, field.name) for field in fields(found)})
+    estimated = estimation.of_logs(loaded, logs[:used], logs[used:], free, report)
+    return Identified(**{field.name: getattr(estimated, field.name) for field in fields(estimated)})
 
 
 def units(kind: str = "spacecraft") -> dict[str, str]:

@@ -33,7 +33,7 @@ def check_inertia(inertia: object) -> np.ndarray:
     moments = np.linalg.eigvalsh(tensor)
     if moments[0] <= 1e-12 * scale:
         raise ValueError(f"the tensor must be positive definite (its smallest principal moment is {moments[0]:.6g})")
-    if not bodies(tensor[None])[0]:
+    if not is_rigid_body(tensor[None])[0]:
         raise ValueError(
             "no rigid body has these principal moments: the largest, "
             f"{moments[2]:.6g}, must not exceed the sum of the other two, {moments[0] + moments[1]:.6g}"
@@ -41,7 +41,7 @@ def check_inertia(inertia: object) -> np.ndarray:
     return tensor
 
 
-def bodies(tensors: np.ndarray) -> np.ndarray:
+def is_rigid_body(tensors: np.ndarray) -> np.ndarray:
     """Return which symmetric tensors (n, 3, 3) [kg m^2] can be the inertia of a rigid body, (n,) bool.
 
     Such a tensor is positive definite, and no principal moment exceeds the sum of the other two.
@@ -50,15 +50,15 @@ def bodies(tensors: np.ndarray) -> np.ndarray:
     return (moments[:, 0] > 1e-12 * scale) & (moments[:, 2] <= (moments[:, 0] + moments[:, 1]) * (1 + 1e-9))
 
 
-def flexible_bodies(tensors: np.ndarray, couplings: np.ndarray) -> np.ndarray:
+def is_flexible_body(tensors: np.ndarray, couplings: np.ndarray) -> np.ndarray:
     """Return which flexible bodies are possible, (n,) bool: those with a positive definite J - D'D.
 
     Args:
         tensors: J (n, 3, 3) [kg m^2].
         couplings: D (n, modes, 3) [sqrt(kg) m].
     """
-    least = np.linalg.eigvalsh(tensors - np.swapaxes(couplings, 1, 2) @ couplings)[:, 0]
-    return least > 1e-9 * np.abs(tensors).max(axis=(1, 2))
+    smallest_moments = np.linalg.eigvalsh(tensors - np.swapaxes(couplings, 1, 2) @ couplings)[:, 0]
+    return smallest_moments > 1e-9 * np.abs(tensors).max(axis=(1, 2))
 
 
 def rest_inertia(inertia: np.ndarray, coupling: Any) -> np.ndarray:
@@ -73,16 +73,16 @@ def rest_inertia(inertia: np.ndarray, coupling: Any) -> np.ndarray:
     """
     rows = np.asarray(coupling, dtype=float)
     rest = inertia - rows.T @ rows
-    if not flexible_bodies(inertia[None], rows[None])[0]:
-        least = float(np.linalg.eigvalsh(rest)[0])
+    if not is_flexible_body(inertia[None], rows[None])[0]:
+        smallest_moment = float(np.linalg.eigvalsh(rest)[0])
         raise ValueError(
             "the inertia minus D'D, the inertia without the modes, must be positive definite "
-            f"(its smallest principal moment is {least:.6g} kg m^2)"
+            f"(its smallest principal moment is {smallest_moment:.6g} kg m^2)"
         )
     return rest
 
 
-def free_modes(inertia: np.ndarray, frequency: Any, coupling: Any) -> np.ndarray:
+def free_mode_frequencies(inertia: np.ndarray, frequency: Any, coupling: Any) -> np.ndarray:
     """Return the undamped angular frequencies (modes,) [rad/s] of a free flexible body.
 
     They solve det(W^2 - w^2 (1 - D J^-1 D')) = 0.
@@ -92,10 +92,10 @@ def free_modes(inertia: np.ndarray, frequency: Any, coupling: Any) -> np.ndarray
         frequency: W of each mode with the body held (modes,) [rad/s].
         coupling: D (modes, 3) [sqrt(kg) m].
     """
-    rows, stiff = np.asarray(coupling, dtype=float), np.asarray(frequency, dtype=float) ** 2
+    rows, stiffness = np.asarray(coupling, dtype=float), np.asarray(frequency, dtype=float) ** 2
     # eliminate w': (1 - D J^-1 D') e'' + W^2 e = 0
     mass = np.eye(len(rows)) - rows @ np.linalg.solve(inertia, rows.T)
-    root = np.sqrt(stiff)
+    root = np.sqrt(stiffness)
     return np.sqrt(np.linalg.eigvalsh(root[:, None] * np.linalg.inv(mass) * root))
 
 
@@ -104,7 +104,7 @@ def surface_roots(a: Any) -> np.ndarray:
     return np.roots([1.0, *np.asarray(a, dtype=float)[::-1]])
 
 
-def hurwitz(a: Any) -> bool:
+def is_hurwitz(a: Any) -> bool:
     """Whether the matrix of (39) is Hurwitz: all roots of p^(n-1) + .. + a_1 have a negative real part."""
     return bool(np.all(np.real(surface_roots(a)) < 0.0))
 
@@ -133,11 +133,13 @@ def pyramid(cant: float = np.arctan(1.0 / np.sqrt(2.0))) -> np.ndarray:
 
     With the default cant, the largest torque is equal about all body axes.
     """
-    around = np.deg2rad([45.0, 135.0, 225.0, 315.0])
-    return np.stack([np.cos(cant) * np.cos(around), np.cos(cant) * np.sin(around), np.full(4, np.sin(cant))], axis=1)
+    azimuths = np.deg2rad([45.0, 135.0, 225.0, 315.0])
+    return np.stack(
+        [np.cos(cant) * np.cos(azimuths), np.cos(cant) * np.sin(azimuths), np.full(4, np.sin(cant))], axis=1
+    )
 
 
-def per_sample(density: float, period: float) -> float:
+def noise_per_sample(density: float, period: float) -> float:
     """Return the noise of samples of white noise, 1 sigma, each averaged over a period: density / sqrt(period).
 
     Args:

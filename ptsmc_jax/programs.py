@@ -34,15 +34,15 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from ptsmc_jax import configure, provenance
 
-LIMIT = 400  # stored programs; the least recently used are deleted
-# compiler options of programs that run for a moment: optimising them would take longer than it saves
+MOST_STORED = 400  # stored programs; the least recently used are deleted
+# compiler options of programs with a short run time: optimising them takes longer than it saves
 _OLDER = {"xla_cpu_use_fusion_emitters": False} if configure.OLDER_EMITTERS else {}
-QUICKLY = {"xla_backend_optimization_level": 0, "xla_cpu_parallel_codegen_split_count": 1, **_OLDER}
+FAST_COMPILE = {"xla_backend_optimization_level": 0, "xla_cpu_parallel_codegen_split_count": 1, **_OLDER}
 # compiler options of batches in `lanes`: with the pass that `configure` disables they compile in 0.7 to 0.9 of the time
 # and run in 0.88 to 0.97 of it. Loops in them write one array of each type of number, see `numerics.stacking`
 BATCHED = {"xla_disable_hlo_passes": ""}
 OURS = provenance.PACKAGES  # packages whose code is identified by its files
-PLAIN = (int, float, str, bool, bytes, type(None))
+LITERAL_TYPES = (int, float, str, bool, bytes, type(None))
 VERSIONS = (sys.version, jax.__version__, jaxlib.version.__version__, np.__version__, scipy.__version__)
 # settings of JAX that change a traced program: `jax.NAME` sets one in a thread, `jax.config.jax_NAME` reads it
 SETTINGS = """default_device enable_x64 debug_nans debug_infs default_matmul_precision default_prng_impl
@@ -50,7 +50,7 @@ SETTINGS = """default_device enable_x64 debug_nans debug_infs default_matmul_pre
 GLOBAL_SETTINGS = ["random_seed_offset", "use_shardy_partitioner"]  # the same in all threads
 # a stored program runs with the version of JAX that made it, so its custom calls need not be stable
 _CHECKS = [export.DisabledSafetyCheck.custom_call("__gpu$xla.gpu.triton")]
-BACKGROUND = "compiling"  # name of the threads that compile what was prepared
+BACKGROUND_THREAD = "compiling"  # prefix of the names of threads that compile prepared programs
 _logger = logging.getLogger(__name__)
 _compiled: dict[str, bool] = {}  # whether each titled program that this process has begun or prepared is compiled
 _awaited: dict[str, None] = {}  # titles of the programs that callers wait for, in the order of their calls
@@ -101,8 +101,8 @@ class Program:
         return self._on_device(self._run, *args, **kwargs)
 
     def prepare(self, *args: Any, **kwargs: Any) -> None:
-        """Begin to compile for such a call in a background thread; do nothing if programs are not stored."""
-        if _stores():
+        """Start to compile the program of such a call in a background thread; do nothing if programs are not stored."""
+        if _is_storing():
             self._on_device(self._prepare, *args, **kwargs)
 
     def _on_device(self, method: Callable, *args: Any, **kwargs: Any) -> Any:
@@ -111,21 +111,25 @@ class Program:
     def _run(self, *args: Any, **kwargs: Any) -> Any:
         if _is_traced(args, kwargs):
             return self._jitted(*args, **kwargs)
-        if not _stores():
-            return _in_caller(self._jitted, *args, **kwargs) if configure.for_command else self._jitted(*args, **kwargs)
+        if not _is_storing():
+            return (
+                _call_uninterrupted(self._jitted, *args, **kwargs)
+                if configure.for_command
+                else self._jitted(*args, **kwargs)
+            )
         thread = threading.current_thread()
         # a background thread must not wait for prepared programs: it would occupy the thread that compiles them
-        if not thread.name.startswith(BACKGROUND):
+        if not thread.name.startswith(BACKGROUND_THREAD):
             if not all(future.done() for future in self._prepared):
                 self._begin(awaited=True)
             for future in self._prepared:
                 if not future.cancel():  # a program that has not begun is compiled here instead
-                    with contextlib.suppress(CancelledError):  # by `stop`
+                    with contextlib.suppress(CancelledError):  # by `cancel_prepared`
                         future.exception()  # an error comes again from the call itself
-        return _in_caller(self._call_stored, *args, **kwargs)
+        return _call_uninterrupted(self._call_stored, *args, **kwargs)
 
     def _call_stored(self, *args: Any, **kwargs: Any) -> Any:
-        args, kwargs = _uncommitted(args, kwargs)
+        args, kwargs = _detach_from_device(args, kwargs)
         try:
             return self._stored(*args, **kwargs)
         finally:
@@ -145,21 +149,21 @@ class Program:
             _awaited.pop(self._title, None)
 
     def _prepare(self, *args: Any, **kwargs: Any) -> None:
-        args, kwargs = _uncommitted(args, kwargs)
+        args, kwargs = _detach_from_device(args, kwargs)
 
-        def compiled() -> None:
+        def compile_program() -> None:
             self._stored.lower(*args, **kwargs).compile()
             _compiled.update({self._title: True} if self._title else {})
 
         self._begin(awaited=False)
-        self._prepared.append(_background().submit(_with_settings(compiled)))
+        self._prepared.append(_background_threads().submit(_with_settings(compile_program)))
 
     def _restored(self) -> Callable:
         """Return the function that JAX traces instead of ours: it calls the stored program, or stores it first."""
 
         @functools.wraps(self._function)
-        def restored(*args: Any, **kwargs: Any) -> Any:
-            self._begin(awaited=not threading.current_thread().name.startswith(BACKGROUND))
+        def call_stored_program(*args: Any, **kwargs: Any) -> Any:
+            self._begin(awaited=not threading.current_thread().name.startswith(BACKGROUND_THREAD))
             try:
                 path = self.path(*args, **kwargs)
                 content = _read(path)
@@ -175,36 +179,38 @@ class Program:
             if exported.nr_devices > 1:
                 mesh = Mesh(np.asarray(configure.devices()[: exported.nr_devices]), ("device",))
                 leaves = jax.lax.with_sharding_constraint(leaves, NamedSharding(mesh, PartitionSpec()))
-            return _build(ast.literal_eval(described.decode()), iter(exported.call(*leaves)))
+            return _build_tree(ast.literal_eval(described.decode()), iter(exported.call(*leaves)))
 
-        return restored
+        return call_stored_program
 
     def _split(self, args: tuple, kwargs: dict) -> tuple[dict, dict]:
         """Return the traced and the static arguments by name, without defaults: these are part of the code."""
-        given = self._signature.bind(*args, **kwargs).arguments
-        traced = {name: value for name, value in given.items() if name not in self._static}
-        return traced, {name: value for name, value in given.items() if name in self._static}
+        arguments = self._signature.bind(*args, **kwargs).arguments
+        traced = {name: value for name, value in arguments.items() if name not in self._static}
+        return traced, {name: value for name, value in arguments.items() if name in self._static}
 
     def _export(self, *args: Any, **kwargs: Any) -> bytes:
         """Return a line that describes the structure of the results, then the serialised program of flat arrays."""
         traced, static = self._split(args, kwargs)
         leaves, structure = jax.tree.flatten(traced)
-        found = []
+        output_structures = []
 
-        def flat(*rows: Any) -> list:
+        def call_flat(*rows: Any) -> list:
             leaves = [jnp.reshape(row, t.shape) for row, t in zip(rows, types, strict=True)]
-            outputs, of_outputs = jax.tree.flatten(self._function(**jax.tree.unflatten(structure, leaves), **static))
-            found.append(of_outputs)
+            outputs, output_structure = jax.tree.flatten(
+                self._function(**jax.tree.unflatten(structure, leaves), **static)
+            )
+            output_structures.append(output_structure)
             return outputs
 
         types: list[Any] = [jax.typeof(leaf) for leaf in leaves]
         # JAX gives scalars of programs for several devices a sharding that only its Shardy partitioner can lower
         shapes = [jax.ShapeDtypeStruct(t.shape or (1,), t.dtype, weak_type=t.weak_type) for t in types]
         platforms = ["cpu"] if configure.backend() == "cpu" else None
-        exported = export.export(jax.jit(flat), platforms=platforms, disabled_checks=_CHECKS)(*shapes)
-        described = _describe_tree(found[0])
-        if jax.tree.structure(_build(described, itertools.repeat(0))) != found[0]:
-            raise NotStorableError(found[0])
+        exported = export.export(jax.jit(call_flat), platforms=platforms, disabled_checks=_CHECKS)(*shapes)
+        described = _describe_tree(output_structures[0])
+        if jax.tree.structure(_build_tree(described, itertools.repeat(0))) != output_structures[0]:
+            raise NotStorableError(output_structures[0])
         return repr(described).encode() + b"\n" + exported.serialize()
 
     def path(self, *args: Any, **kwargs: Any) -> Path:
@@ -220,10 +226,10 @@ class Program:
         traced, static = self._split(args, kwargs)
         leaves, structure = jax.tree.flatten(traced)
         devices = [f"{device.platform} {device.device_kind}" for device in configure.devices()]  # of the default device
-        settings = _settings()[1:] + [getattr(jax.config, f"jax_{name}") for name in GLOBAL_SETTINGS]
-        code, arguments = provenance.code_checksum(*sorted({package, OURS[0]})), _describe(static)
-        known = module, name, code, arguments, _describe_tree(structure), [_type(leaf) for leaf in leaves]
-        checksum = hashlib.sha256(repr((known, VERSIONS, devices, settings)).encode()).hexdigest()
+        settings = _thread_settings()[1:] + [getattr(jax.config, f"jax_{name}") for name in GLOBAL_SETTINGS]
+        code, arguments = provenance.code_checksum(*sorted({package, OURS[0]})), _describe_value(static)
+        identity = module, name, code, arguments, _describe_tree(structure), [_argument_type(leaf) for leaf in leaves]
+        checksum = hashlib.sha256(repr((identity, VERSIONS, devices, settings)).encode()).hexdigest()
         assert configure.programs is not None
         return configure.programs / f"{checksum}.stablehlo"
 
@@ -267,7 +273,7 @@ def _to_host(leaf: Any) -> Any:
     return leaf if unchanged else np.asarray(leaf)
 
 
-def _stores() -> bool:
+def _is_storing() -> bool:
     """Return whether programs are stored; a function that is not to be compiled has none."""
     return configure.programs is not None and not jax.config.jax_disable_jit  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -276,7 +282,7 @@ def _is_traced(args: tuple, kwargs: dict) -> bool:
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((args, kwargs)))
 
 
-def _uncommitted(args: tuple, kwargs: dict) -> tuple[tuple, dict]:
+def _detach_from_device(args: tuple, kwargs: dict) -> tuple[tuple, dict]:
     """Return the arguments without arrays that are tied to the first device, as results of stored programs are.
 
     A program for several devices would refuse them.
@@ -285,38 +291,38 @@ def _uncommitted(args: tuple, kwargs: dict) -> tuple[tuple, dict]:
     if len(devices) == 1:
         return args, kwargs
 
-    def free(leaf: Any) -> Any:
+    def detach(leaf: Any) -> Any:
         is_tied = isinstance(leaf, jax.Array) and leaf.committed and leaf.devices() == {devices[0]}
         return _to_host(leaf) if is_tied else leaf
 
-    return jax.tree.map(free, (args, kwargs))
+    return jax.tree.map(detach, (args, kwargs))
 
 
-def _type(leaf: Any) -> tuple:
-    """Return what a program is compiled for: shape, name of the dtype, and whether the dtype is weak."""
-    found: Any = jax.typeof(leaf)
-    if jnp.issubdtype(found.dtype, jax.dtypes.extended):  # as of keys
-        raise NotStorableError(found.dtype)
-    return found.shape, found.dtype.name, found.weak_type
+def _argument_type(leaf: Any) -> tuple:
+    """Return what determines the program for an argument: shape, name of the dtype, and whether the dtype is weak."""
+    array_type: Any = jax.typeof(leaf)
+    if jnp.issubdtype(array_type.dtype, jax.dtypes.extended):  # as of keys
+        raise NotStorableError(array_type.dtype)
+    return array_type.shape, array_type.dtype.name, array_type.weak_type
 
 
 def _describe_tree(structure: Any) -> Any:
-    """Return the structure of a tree as literals that mean the same in every process; see `_build`."""
+    """Return the structure of a tree as literals that mean the same in every process; see `_build_tree`."""
     data = structure.node_data()
     if data is None:
         return "leaf"
     if data[0] is type(None):
         return None
-    return _describe(data[0]), _describe(data[1]), [_describe_tree(child) for child in structure.children()]
+    return _describe_value(data[0]), _describe_value(data[1]), [_describe_tree(child) for child in structure.children()]
 
 
-def _build(described: Any, leaves: Iterator) -> Any:
+def _build_tree(described: Any, leaves: Iterator) -> Any:
     """Return the tree whose structure `_describe_tree` described, with these leaves."""
     if not isinstance(described, tuple):
         return next(leaves) if described == "leaf" else None
     (_, module, name), fixed, children = described
-    kind: Any = _named(module, name)
-    values = [_build(child, leaves) for child in children]
+    kind: Any = _find_object(module, name)
+    values = [_build_tree(child, leaves) for child in children]
     if kind in (tuple, list):
         return kind(values)
     if issubclass(kind, dict):
@@ -327,15 +333,15 @@ def _build(described: Any, leaves: Iterator) -> Any:
     return kind(**{f.name: value for f, value in zip(names, [*values, *fixed[2]], strict=True)})  # `pytrees.pytree`
 
 
-def _describe(value: Any) -> Any:
+def _describe_value(value: Any) -> Any:
     """Return a static value as literals that mean the same in every process."""
-    if type(value) in PLAIN:
+    if type(value) in LITERAL_TYPES:
         return value
     if isinstance(value, type) or inspect.isfunction(value):
         module, name = str(value.__module__), value.__qualname__
-        ours = module.split(".")[0] in (*OURS, "builtins", "collections") and "<locals>" not in name
+        is_identifiable = module.split(".")[0] in (*OURS, "builtins", "collections") and "<locals>" not in name
         # a type's name may be set by the function that makes it, a function's by `functools.wraps` on another
-        if not ours or (inspect.isfunction(value) and _named(module, name) is not value):
+        if not is_identifiable or (inspect.isfunction(value) and _find_object(module, name) is not value):
             raise NotStorableError(value)
         return "name", module, name
     if isinstance(value, tuple | list):
@@ -346,22 +352,22 @@ def _describe(value: Any) -> Any:
         parts = [(f.name, getattr(value, f.name)) for f in fields(value)]
     else:
         raise NotStorableError(value)
-    return "value", _describe(type(value)), [_describe(part) for part in parts]
+    return "value", _describe_value(type(value)), [_describe_value(part) for part in parts]
 
 
-def _named(module: str, name: str) -> Any:
-    """Return what a module has under a dotted name, or None."""
+def _find_object(module: str, name: str) -> Any:
+    """Return the object with this dotted name in a module, or None."""
     return functools.reduce(lambda owner, part: getattr(owner, part, None), name.split("."), sys.modules.get(module))
 
 
 @functools.cache
-def _background() -> ThreadPoolExecutor:
-    """Return the threads that compile what was prepared."""
-    return ThreadPoolExecutor(max(1, len(configure.processors()) - 1), BACKGROUND)
+def _background_threads() -> ThreadPoolExecutor:
+    """Return the pool of threads that compile prepared programs."""
+    return ThreadPoolExecutor(max(1, len(configure.processors()) - 1), BACKGROUND_THREAD)
 
 
 @functools.cache
-def _caller() -> ThreadPoolExecutor:
+def _caller_thread() -> ThreadPoolExecutor:
     """Return the thread that runs the main thread's calls, which no Ctrl-C interrupts.
 
     If an interrupt ended the waiting for XLA, it would go on compiling for a client that the exit deletes, and the
@@ -370,35 +376,35 @@ def _caller() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(1, "running")
 
 
-def _in_caller(function: Callable, *args: Any, **kwargs: Any) -> Any:
-    """Call a function in the thread `_caller` if this is the main thread."""
+def _call_uninterrupted(function: Callable, *args: Any, **kwargs: Any) -> Any:
+    """Call a function in the thread `_caller_thread` if this is the main thread."""
     if threading.current_thread() is not threading.main_thread():
         return function(*args, **kwargs)
-    return _caller().submit(_with_settings(function), *args, **kwargs).result()
+    return _caller_thread().submit(_with_settings(function), *args, **kwargs).result()
 
 
 def _with_settings(function: Callable) -> Callable:
-    """Return the function as it runs in another thread with this thread's settings of JAX."""
-    settings = _settings()
+    """Return a function that applies this thread's settings of JAX when another thread calls it."""
+    settings = _thread_settings()
 
-    def called(*args: Any, **kwargs: Any) -> Any:
+    def call_with_settings(*args: Any, **kwargs: Any) -> Any:
         with contextlib.ExitStack() as stack:
             for name, value in zip(SETTINGS, settings, strict=True):
                 stack.enter_context(getattr(jax, name)(value))
             return function(*args, **kwargs)
 
-    return called
+    return call_with_settings
 
 
-def _settings() -> list:
+def _thread_settings() -> list:
     return [getattr(jax.config, f"jax_{name}") for name in SETTINGS]
 
 
-def stop() -> None:
-    """Cancel what was prepared and has not begun."""
-    if _background.cache_info().currsize:
-        _background().shutdown(wait=False, cancel_futures=True)
-        _background.cache_clear()
+def cancel_prepared() -> None:
+    """Cancel the prepared programs whose compilation has not begun."""
+    if _background_threads.cache_info().currsize:
+        _background_threads().shutdown(wait=False, cancel_futures=True)
+        _background_threads.cache_clear()
 
 
 def _read(path: Path) -> bytes | None:
@@ -423,7 +429,7 @@ def _write(path: Path, content: bytes) -> None:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         temporary.write_bytes(_checksum(path, content) + content)
         os.replace(temporary, path)
-        for old in sorted(path.parent.iterdir(), key=lambda p: p.stat().st_mtime)[:-LIMIT]:
+        for old in sorted(path.parent.iterdir(), key=lambda p: p.stat().st_mtime)[:-MOST_STORED]:
             old.unlink(missing_ok=True)
     except OSError as error:  # a full disk, a folder that cannot be written
         _logger.info("%s is not stored: %s", path, error)

@@ -1,11 +1,11 @@
-"""The source code that made a result or a compiled program, known by its checksum."""
+"""Checksum of the source code, which identifies the version that made a result or a compiled program."""
 
 import functools
 import hashlib
 from pathlib import Path
 
 PACKAGES = ("ptsmc_jax", "tuning")
-FOLDER = Path(__file__).parent.parent  # of the packages
+FOLDER = Path(__file__).parent.parent  # folder that contains the packages
 
 
 @functools.cache

@@ -119,7 +119,9 @@ def roomy(timing: Any) -> Any:
 def fly(run: Parts, seed: int = 0, trial: int = 0) -> Any:
     """Simulate a run with its history as NumPy arrays. One program serves all parts with the same structure."""
     numbers = jax.tree.map(np.asarray, run)  # without the weak types of Python numbers
-    simulated = rollout.simulate_parts(numbers, np.uint32(seed), np.uint32(trial), record=True, software=rollout.OURS)
+    simulated = rollout.simulate_parts(
+        numbers, np.uint32(seed), np.uint32(trial), record=True, software=rollout.PYTHON_SOFTWARE
+    )
     return jax.tree.map(np.asarray, simulated)
 
 
@@ -179,13 +181,13 @@ def parts(
     t_end = t_f + 10.0 if t_end is None else t_end
     if period is None:
         pace = max(k1 / 2, surface_rate)
-        timing: Any = clock.graded(t_f, delta, t_end, 1.0, pace, 0.1, (0.2 * t_f, 0.2), saves)
+        timing: Any = clock.graded_clock(t_f, delta, t_end, 1.0, pace, 0.1, (0.2 * t_f, 0.2), saves)
         timing = timing if len(saves) else roomy(timing)
     elif flight:
-        timing = clock.flight(period, t_end)
+        timing = clock.flight_clock(period, t_end)
     else:
         longest = reach or (t_f, delta)
-        timing = roomy(clock.anchored(period, t_end, longest[0], t_end - t_f + longest[1]))
+        timing = roomy(clock.anchored_clock(period, t_end, longest[0], t_end - t_f + longest[1]))
     return Parts(
         plant=body,
         disturbance=disturbance
@@ -240,13 +242,13 @@ def chain_parts(
     gains = tuple(vector(v) for v in (t_f, eta, delta, k1, sign_width, surface_rate))
     law = PrescribedTimeChain(ChainKinematics(model), *gains, a=vector(a))
     if period is not None:
-        timing: Any = roomy(clock.anchored(period, t_end, t_f, 2.0 + delta))
+        timing: Any = roomy(clock.anchored_clock(period, t_end, t_f, 2.0 + delta))
     elif steps is not None:
         largest = vector(1.5 * t_f / steps[0])
         timing = clock.Graded(vector(t_end), vector(1.0), largest, jnp.zeros(0), *steps)
     else:
         pace = max(rates.hold_rates(law).values())
-        timing = roomy(clock.graded(t_f, delta, t_end, 1.0, pace, 0.0, (0.0, 0.0), (), n))
+        timing = roomy(clock.graded_clock(t_f, delta, t_end, 1.0, pace, 0.0, (0.0, 0.0), (), n))
     return Parts(
         plant=model,
         disturbance=disturbance or disturbances.Constant(jnp.zeros(1)),
@@ -265,7 +267,7 @@ def chain_parts(
 def chain_flight() -> Parts:
     """Return a chain with noise on the flight clock. Its t_f and t_end lie between samples."""
     run = chain_parts([1.0, 0.2], 5.02, delta=0.53, period=0.05, noise=[2e-4, 1e-4])
-    return dataclasses.replace(run, clock=clock.flight(0.05, 7.02))
+    return dataclasses.replace(run, clock=clock.flight_clock(0.05, 7.02))
 
 
 def with_controller(run: Parts, **changes: Any) -> Parts:
@@ -333,10 +335,10 @@ def small_search(monkeypatch, held_out=40):
         (worst, "SCREENED", 48),
         (worst, "STEPS", 5),
         (confirm, "HELD_OUT", held_out),
-        (confirm, "FEWEST", 64),
-        (starts, "SWEPT", 16),
-        (starts, "WIDELY", 64),
-        (local_searches, "MANY", 16),
+        (confirm, "FEWEST_TRIALS", 64),
+        (starts, "CANDIDATES", 16),
+        (starts, "GLOBAL_CANDIDATES", 64),
+        (local_searches, "SOBOL_POINTS", 16),
         (evolution, "GENERATIONS", 3),
     ):
         monkeypatch.setattr(module, name, value)

@@ -40,7 +40,7 @@ def test_the_cache_folder_follows_the_xdg_standard(tmp_path, monkeypatch, said):
     """The folder is in $XDG_CACHE_HOME, or in ~/.cache if the variable is not set or empty."""
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / said) if said else "")
-    folder = setup._cache_folder()
+    folder = setup._default_cache_folder()
     assert folder is not None
     assert folder.parent == tmp_path / (said or ".cache") / "ptsmc-jax"
 
@@ -53,10 +53,10 @@ def test_a_user_without_a_home_has_no_cache(monkeypatch):
 
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     monkeypatch.setattr(setup.Path, "home", unknown)
-    assert setup._cache_folder() is None
+    assert setup._default_cache_folder() is None
 
 
-ALL, EXTRA = setup._options("cpu"), "--xla_backend_extra_options"
+ALL, EXTRA = setup._compiler_options("cpu"), "--xla_backend_extra_options"
 LEVEL = "--xla_backend_optimization_level"
 
 
@@ -72,7 +72,7 @@ LEVEL = "--xla_backend_optimization_level"
 def test_options_depend_on_version_machine_and_device(monkeypatch, jaxlib, machine, device, included, excluded):
     monkeypatch.setattr(setup, "JAXLIB", jaxlib)
     monkeypatch.setattr(setup, "MACHINE", machine)
-    options = setup._options(device)
+    options = setup._compiler_options(device)
     assert set(included) <= set(options)
     assert not set(excluded) & set(options)
 
@@ -80,18 +80,18 @@ def test_options_depend_on_version_machine_and_device(monkeypatch, jaxlib, machi
 @pytest.mark.parametrize("plug_in", [None, "a plug-in"])
 def test_a_gpu_may_be_used_if_a_plug_in_is_installed(monkeypatch, plug_in):
     monkeypatch.setattr(setup.importlib.util, "find_spec", lambda name: plug_in)
-    assert setup._options(None) == setup._options("gpu" if plug_in else "cpu")
+    assert setup._compiler_options(None) == setup._compiler_options("gpu" if plug_in else "cpu")
 
 
 def test_an_unknown_machine_gets_no_options_and_a_warning(monkeypatch):
     monkeypatch.setattr(setup, "MACHINE", "riscv64")
     with pytest.warns(RuntimeWarning, match="no compiler options are known for jaxlib .* on riscv64"):
-        assert setup._options("cpu") == ()
+        assert setup._compiler_options("cpu") == ()
 
 
 def test_options_are_written_as_xla_reads_them():
-    assert setup._flags("", ("a=1", "--b=2", "-c=3")) == f"{EXTRA}=a=1,-c=3 --b=2"
-    assert setup._flags("", ()) == ""
+    assert setup._merge_flags("", ("a=1", "--b=2", "-c=3")) == f"{EXTRA}=a=1,-c=3 --b=2"
+    assert setup._merge_flags("", ()) == ""
 
 
 @pytest.mark.parametrize(
@@ -100,13 +100,13 @@ def test_options_are_written_as_xla_reads_them():
 )
 def test_options_of_the_user_take_precedence(user):
     """XLA uses the last of two equal options. No option is added to a decisive option or a file of the user."""
-    flags = setup._flags(user, ALL)
+    flags = setup._merge_flags(user, ALL)
     assert flags.startswith(user)
     assert (flags == user) == user.startswith((EXTRA, "--xla_disable_hlo_passes", "a/file"))
     assert flags.count(f"{LEVEL}=") <= 1
-    assert setup._flags(flags, ALL) == flags  # a second call, or a child process
-    assert setup._flags(flags, ()) == user
-    assert setup._flags(setup._flags(user, setup._options("gpu")), ALL) == flags
+    assert setup._merge_flags(flags, ALL) == flags  # a second call, or a child process
+    assert setup._merge_flags(flags, ()) == user
+    assert setup._merge_flags(setup._merge_flags(user, setup._compiler_options("gpu")), ALL) == flags
 
 
 @pytest.mark.parametrize("mode", [0o700, 0o770, 0o702])
@@ -116,10 +116,10 @@ def test_a_cache_that_other_users_can_write_is_not_used(tmp_path, mode):
     folder.mkdir()
     folder.chmod(mode)
     if mode == 0o700:
-        assert setup._usable(folder) == folder
+        assert setup._check_cache_folder(folder) == folder
     else:
         with pytest.warns(RuntimeWarning, match="is not used: it must be a folder that belongs to you"):
-            assert setup._usable(folder) is None
+            assert setup._check_cache_folder(folder) is None
 
 
 @pytest.mark.parametrize("case", ["of somebody else", "a link", "a file", "closed"])
@@ -139,11 +139,11 @@ def test_a_cache_folder_of_another_user_is_not_used(tmp_path, monkeypatch, case)
 
         monkeypatch.setattr(setup.Path, "mkdir", refused)
     with pytest.warns(RuntimeWarning, match="is not used"):
-        assert setup._usable(folder) is None
+        assert setup._check_cache_folder(folder) is None
 
 
 def test_a_new_cache_is_closed_to_others(tmp_path):
-    assert setup._usable(tmp_path / "a" / "cache") == tmp_path / "a" / "cache"
+    assert setup._check_cache_folder(tmp_path / "a" / "cache") == tmp_path / "a" / "cache"
     assert (tmp_path / "a" / "cache").stat().st_mode & 0o777 == 0o700
 
 
@@ -152,7 +152,7 @@ def test_a_read_only_cache_causes_one_warning(tmp_path, monkeypatch):
     monkeypatch.setattr(setup.os, "access", lambda *_: False)
     with warnings.catch_warnings(record=True) as shown:
         warnings.simplefilter("default")
-        assert setup._usable(tmp_path) == tmp_path
+        assert setup._check_cache_folder(tmp_path) == tmp_path
         for k in range(3):
             warnings.warn(f"Error writing persistent compilation cache entry for 'jit_{k}': why", stacklevel=1)
         warnings.warn("something else", stacklevel=1)
@@ -163,7 +163,7 @@ def test_the_options_of_this_version_and_machine_change_no_result():
     """The test needs a separate process, because XLA ends a process that sets an unknown option."""
 
     def tried(options):
-        environment = {**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": setup._flags("", options)}
+        environment = {**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": setup._merge_flags("", options)}
         return subprocess.run([sys.executable, "-c", _TRIAL], env=environment, capture_output=True, check=False)
 
     assert tried(ALL).returncode == 0
@@ -286,7 +286,7 @@ def test_truncated_cache_entries_are_compiled_again(told):
     assert (told["found"], told["cut"]) == ([7.0, 7.0], True)
 
 
-@pytest.mark.parametrize("options", [None, programs.QUICKLY], ids=["as usual", "quickly"])
+@pytest.mark.parametrize("options", [None, programs.FAST_COMPILE], ids=["as usual", "quickly"])
 def test_reverse_mode_writes_its_residuals_in_place(options):
     """XLA would copy whole arrays in every step if a fusion with several outputs wrote into them."""
 

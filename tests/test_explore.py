@@ -183,7 +183,7 @@ def test_an_animation_is_one_page_without_external_files(flight, tmp_path):
 
 def test_rotated_axes_match_scipy():
     turn, vectors = Rotation.from_rotvec([0.4, -1.2, 0.7]), np.random.default_rng(0).normal(size=(5, 3))
-    np.testing.assert_allclose(animation.turned(turn.as_quat(), vectors), turn.apply(vectors), atol=1e-14)
+    np.testing.assert_allclose(animation.rotate_to_inertial(turn.as_quat(), vectors), turn.apply(vectors), atol=1e-14)
 
 
 def peak(result, parts):
@@ -240,11 +240,11 @@ def test_an_animation_draws_body_and_reference_at_even_times(monkeypatch):
     for q, lines in ((log.x.q[0], drawn[0][1]), (log.x.q[-1], drawn[-1][1])):
         np.testing.assert_allclose(np.sort([np.linalg.norm(b - a) for a, b in lines[:12]]), edges, rtol=1e-12)
         corners = np.unique(np.round(np.concatenate(lines[:12]), 9), axis=0)
-        back = animation.turned(np.append(-q[:3], q[3]), corners)
+        back = animation.rotate_to_inertial(np.append(-q[:3], q[3]), corners)
         np.testing.assert_allclose(np.abs(back), np.tile(animation.SIDES, (8, 1)), atol=1e-8)
         for at, three in ((q, lines[12:15]), (log.reference.q[0], lines[15:])):
             np.testing.assert_allclose(
-                [end for _, end in three], animation.turned(np.asarray(at), np.eye(3)), atol=1e-12
+                [end for _, end in three], animation.rotate_to_inertial(np.asarray(at), np.eye(3)), atol=1e-12
             )
 
 
@@ -313,7 +313,7 @@ def test_a_campaign_is_refused_before_anything_is_written(tmp_path):
     for search in (tuning.tune, tuning.pareto):
         with pytest.raises(ValueError, match="seed is -1, but must be a whole number from 0"):
             search(chain, seed=-1)
-    with store.in_use(tmp_path / "c"), pytest.raises(store.InUseError, match="is in use by another"):
+    with store.lock_folder(tmp_path / "c"), pytest.raises(store.InUseError, match="is in use by another"):
         tuning.montecarlo(chain, 2, folder=tmp_path / "c")
     assert list(tmp_path.iterdir()) == []
 

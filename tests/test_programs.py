@@ -166,7 +166,8 @@ def test_a_program_is_named_while_a_caller_waits_for_its_compilation(folder, mon
 def test_a_prepared_program_can_call_another_prepared_program(folder, monkeypatch):
     """Waiting for the own thread would be a deadlock."""
     monkeypatch.setattr(configure, "processors", lambda: [None])  # one thread
-    monkeypatch.setattr(programs, "_background", programs.functools.cache(programs._background.__wrapped__))
+    threads = programs.functools.cache(programs._background_threads.__wrapped__)
+    monkeypatch.setattr(programs, "_background_threads", threads)
     begin, (inner, _) = threading.Event(), spied("inner")
 
     def function(x):
@@ -275,7 +276,7 @@ def test_results_keep_their_structure(folder):
 
 def test_a_result_can_be_an_argument_of_a_program_for_several_devices(folder):
     def function(x, devices):
-        return montecarlo.over_devices(lambda part: 2.0 * part + x, jnp.arange(4.0), devices)
+        return montecarlo.map_over_devices(lambda part: 2.0 * part + x, jnp.arange(4.0), devices)
 
     one, two = spied()[0](1.0)["both"], programs.jit(ours(function, "several"), static_argnames="devices", batch=True)
     for results in (two(one, 2), two(two(one, 2)[0], 2)):
@@ -355,7 +356,7 @@ def test_a_program_that_cannot_be_identified_is_traced(folder):
 
 
 def test_the_least_recently_used_files_are_deleted(folder, monkeypatch):
-    monkeypatch.setattr(programs, "LIMIT", 3)
+    monkeypatch.setattr(programs, "MOST_STORED", 3)
     made = []
     for k in range(4):
         before = set(folder.iterdir()) if folder.exists() else set()
@@ -382,7 +383,7 @@ traced = []
 def poles(a, scale):
     traced.append(1)
     values = jnp.linalg.eigvals(a)
-    spread = montecarlo.over_devices(lambda x: jnp.sin(3.0 * x) * x + scale, jnp.arange(4.0), 2)
+    spread = montecarlo.map_over_devices(lambda x: jnp.sin(3.0 * x) * x + scale, jnp.arange(4.0), 2)
     return jnp.sort(jnp.abs(values)), spread
 
 poles.__module__, poles.__qualname__ = "ptsmc_jax.theory.linear", "poles"

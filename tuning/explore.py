@@ -60,7 +60,8 @@ class Outcome:
         report = self.report
         lines = [report.headline, *report.lines]
         for title, content in report.printed():
-            lines += [*(("", title) if title else ()), *(_columns(content) if isinstance(content, Table) else content)]
+            lines += ["", title] if title else []
+            lines += _aligned_lines(content) if isinstance(content, Table) else content
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
@@ -72,7 +73,7 @@ class Outcome:
         return text
 
 
-def _columns(table: Table) -> list[str]:
+def _aligned_lines(table: Table) -> list[str]:
     """Return the lines of a table with aligned columns."""
     cells = [table.head, *table.rows]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
@@ -83,7 +84,7 @@ def _columns(table: Table) -> list[str]:
 class Tuned(Outcome):
     """Gains that a search found, verified on held-out trials. Its figures are those of `ptsmc tune`."""
 
-    given: Scenario  # before the search
+    original: Scenario  # before the search
     tuning: Tuning
 
     @property
@@ -112,7 +113,7 @@ class Tuned(Outcome):
         return tune_report.build(summaries.tune(self.summary))
 
     def _figures(self) -> dict[str, Any]:
-        return tune_files.figures_of(self.given, self.tuning)
+        return tune_files.figures_of(self.original, self.tuning)
 
 
 def tune(what: Scenario | Study | str | Path, *, seed: int = 0) -> Tuned:
@@ -127,8 +128,8 @@ def tune(what: Scenario | Study | str | Path, *, seed: int = 0) -> Tuned:
         ValueError: `seed` is not a whole number from 0 to 2^32 - 1.
     """
     draws.check_whole_number("seed", seed)
-    given = posing.with_tune(_read(what))
-    return Tuned(given, tuner.tune(given, seed))
+    original = posing.with_tune(_to_scenario(what))
+    return Tuned(original, tuner.tune(original, seed))
 
 
 @dataclass(frozen=True, repr=False)
@@ -141,7 +142,7 @@ class Traced(Outcome):
     @property
     def points(self) -> list[Point]:
         """The points that no other point dominates, in the order of the traded quantity."""
-        return self.front.kept
+        return self.front.non_dominated
 
     @property
     def report(self) -> Report:
@@ -174,7 +175,7 @@ def pareto(
         ValueError: `seed` is not a whole number from 0 to 2^32 - 1.
     """
     draws.check_whole_number("seed", seed)
-    trade = trades.build(against, posing.with_tune(_read(what)), points, values)
+    trade = trades.build(against, posing.with_tune(_to_scenario(what)), points, values)
     return Traced(trade, fronts.trace(trade, seed))
 
 
@@ -208,7 +209,7 @@ def margins(what: Scenario | Study | str | Path) -> Margins:
     Raises:
         ScenarioError: the loop is continuous, or it has no finite derivatives.
     """
-    return Margins(*stability.find(_read(what)))
+    return Margins(*stability.find_margins(_to_scenario(what)))
 
 
 @dataclass(frozen=True, repr=False)
@@ -235,7 +236,7 @@ class Campaign(Outcome):
     @property
     def rows(self) -> pl.DataFrame:
         """One row for each trial, see `ptsmc_jax.trials`."""
-        return rows.read(self.folder.whole_parts())
+        return rows.read(self.folder.intact_parts())
 
     def worst(self, by: str = "window_error", count: int = 5) -> pl.DataFrame:
         """Return the rows of the worst trials, failed trials first.
@@ -244,7 +245,7 @@ class Campaign(Outcome):
             by: column that orders the trials.
             count: number of rows.
         """
-        return campaign_summary.worst(self.folder, by, count)
+        return campaign_summary.worst_trials(self.folder, by, count)
 
     def _figures(self) -> dict[str, Any]:
         return campaign_figures.build(self.folder, self.summary)
@@ -277,30 +278,30 @@ def montecarlo(
     draws.check_whole_number("seed", seed)
     draws.check_whole_number("trials", trials, 1)
     path = Path(tempfile.mkdtemp()) / "campaign" if folder is None else Path(folder)
-    loaded = _read(what) if controller is None else on_flight_clock(_read(what))
-    begun = Folder(path, loaded, seed, trials, controller=None if controller is None else Path(controller))
-    _ = begun.campaign  # raises ScenarioError before anything is written
-    with store.in_use(path):
-        campaign_folder.begin(begun, force=False)
-        campaign_theory.prepare(begun)
-        campaign_folder.simulate(begun, (1, 1), lambda tally: None)
-        campaign_theory.write_missing(begun)
-    return Campaign(begun)
+    loaded = _to_scenario(what) if controller is None else on_flight_clock(_to_scenario(what))
+    target = Folder(path, loaded, seed, trials, controller=None if controller is None else Path(controller))
+    _ = target.campaign  # raises ScenarioError before anything is written
+    with store.lock_folder(path):
+        campaign_folder.begin(target, force=False)
+        campaign_theory.prepare(target)
+        campaign_folder.simulate(target, (1, 1), lambda tally: None)
+        campaign_theory.write_missing(target)
+    return Campaign(target)
 
 
 @dataclass(frozen=True, repr=False)
 class Reproduced(Outcome):
     """The claims of the paper beside the measurements. Its figures are those of `ptsmc reproduce`."""
 
-    found: Reproduction
+    reproduction: Reproduction
 
     @property
     def report(self) -> Report:
         """The report of `ptsmc reproduce`."""
-        return paper_report.build(summaries.read(summaries.Paper, reproduction.summary(self.found)))
+        return paper_report.build(summaries.read(summaries.Paper, reproduction.summary(self.reproduction)))
 
     def _figures(self) -> dict[str, Any]:
-        return reproduction.figures_of(self.found)
+        return reproduction.figures_of(self.reproduction)
 
 
 def reproduce() -> Reproduced:
@@ -308,5 +309,5 @@ def reproduce() -> Reproduced:
     return Reproduced(reproduction.reproduce())
 
 
-def _read(what: Scenario | Study | str | Path) -> Scenario:
+def _to_scenario(what: Scenario | Study | str | Path) -> Scenario:
     return reading.to_scenario(what.scenario if isinstance(what, Study) else what)

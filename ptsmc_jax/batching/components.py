@@ -161,12 +161,12 @@ class ComponentRules:
         operation = partial(eqn.primitive.bind, **eqn.primitive.get_bind_params(eqn.params))
         simplify = _ZERO_RULES.get(name) if _has_tangent(values) else None
 
-        def component(*operands: Any) -> Any:
+        def apply_to_component(*operands: Any) -> Any:
             result = None if simplify is None else simplify(*operands)
             return operation(*self.broadcast(operands)) if result is None else result
 
         operands = [np.broadcast_to(value.components, shape).flat for value in values]
-        return [object_array(shape, map(self.replacements.get(name, component), *operands))]
+        return [object_array(shape, map(self.replacements.get(name, apply_to_component), *operands))]
 
     def _bitcast(self, eqn: Any, values: Sequence[BatchedArray]) -> list[np.ndarray] | None:
         same_size = eqn.invars[0].aval.dtype.itemsize == eqn.outvars[0].aval.dtype.itemsize
@@ -247,10 +247,10 @@ def pick_entries(eqn: Any, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
         case "squeeze" | "expand_dims":
             return [first.reshape(shape)]
         case "broadcast_in_dim":
-            spread = [1] * len(shape)
+            expanded = [1] * len(shape)
             for axis, size in zip(params["broadcast_dimensions"], first.shape, strict=True):
-                spread[axis] = size
-            return [np.broadcast_to(first.reshape(spread), shape)]
+                expanded[axis] = size
+            return [np.broadcast_to(first.reshape(expanded), shape)]
         case "slice":
             steps = params["strides"] or (1,) * len(shape)
             return [first[tuple(map(slice, params["start_indices"], params["limit_indices"], steps))]]
@@ -299,15 +299,15 @@ def contract_entries(eqn: Any, left: np.ndarray, right: np.ndarray, inner: Calla
         inner: (row (n,), column (n,)) -> their scalar product.
     """
 
-    def rows(array: np.ndarray, axes: Sequence[int], batch: Sequence[int]) -> np.ndarray:
+    def group_axes(array: np.ndarray, axes: Sequence[int], batch: Sequence[int]) -> np.ndarray:
         """Return the array as (batch, kept, contracted)."""
         kept = [a for a in range(array.ndim) if a not in (*axes, *batch)]
         sizes = [math.prod(array.shape[a] for a in group) for group in (batch, kept, axes)]
         return array.transpose([*batch, *kept, *axes]).reshape(sizes)
 
-    a, b = (rows(*each) for each in zip((left, right), *eqn.params["dimension_numbers"], strict=True))
-    every = itertools.product(range(len(a)), range(a.shape[1]), range(b.shape[1]))
-    return object_array(eqn.outvars[0].aval.shape, (inner(a[k, i], b[k, j]) for k, i, j in every))
+    a, b = (group_axes(*each) for each in zip((left, right), *eqn.params["dimension_numbers"], strict=True))
+    indices = itertools.product(range(len(a)), range(a.shape[1]), range(b.shape[1]))
+    return object_array(eqn.outvars[0].aval.shape, (inner(a[k, i], b[k, j]) for k, i, j in indices))
 
 
 def accumulate_entries(eqn: Any, array: np.ndarray, operation: Callable[[Any, Any], Any]) -> np.ndarray:

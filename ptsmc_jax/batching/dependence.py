@@ -101,20 +101,20 @@ def unpack_while(eqn: Any, operands: Sequence[T]) -> tuple[Any, Any, Sequence[T]
         return test, body, test_consts, body_consts, init
     run_test, run_body = core.jaxpr_as_fun(test), core.jaxpr_as_fun(body)
 
-    def any_row(*inside: Any) -> Any:
-        return lax.reduce_or(run_test(*inside)[0], rows_axes)
+    def any_row(*loop_operands: Any) -> Any:
+        return lax.reduce_or(run_test(*loop_operands)[0], rows_axes)
 
-    def step(*inside: Any) -> list:
-        of_test, of_body, carries = split_while_operands(eqn.params, inside)
-        (running,) = run_test(*of_test, *carries)
-        after = run_body(*of_body, *carries)
+    def step(*loop_operands: Any) -> list:
+        test_inputs, body_inputs, carries = split_while_operands(eqn.params, loop_operands)
+        (running,) = run_test(*test_inputs, *carries)
+        after = run_body(*body_inputs, *carries)
         masks = (lax.broadcast_in_dim(running, new.shape, rows_axes) for new in after)
         return [lax.select(mask, new, old) for mask, new, old in zip(masks, after, carries, strict=True)]
 
     avals = [v.aval for v in eqn.invars]
-    of_test, _, carries = split_while_operands(eqn.params, avals)
+    test_inputs, _, carries = split_while_operands(eqn.params, avals)
     masked = jax.make_jaxpr(step)(*avals)
-    return jax.make_jaxpr(any_row)(*of_test, *carries), masked, test_consts, [*test_consts, *body_consts], init
+    return jax.make_jaxpr(any_row)(*test_inputs, *carries), masked, test_consts, [*test_consts, *body_consts], init
 
 
 def union(flags: Sequence[int]) -> int:
@@ -139,10 +139,10 @@ def scan_dependence(body: core.Jaxpr, consts: Sequence[int], init: Sequence[int]
     carries = list(init)
     while True:
         outputs = dependence(body, [*consts, *carries, *xs])
-        wider = [a | b for a, b in zip(carries, outputs, strict=False)]
-        if wider == carries:
+        updated = [a | b for a, b in zip(carries, outputs, strict=False)]
+        if updated == carries:
             return [*carries, *outputs[len(carries) :]]
-        carries = wider
+        carries = updated
 
 
 def while_dependence(
@@ -176,14 +176,14 @@ def branch_dependence(branches: Sequence, index: int, operands: Sequence[int]) -
 
 def _propagate(eqn: Any, flags: list[int]) -> list[int]:
     """Return the flags of the results of one equation. Calls, branches and loops are evaluated result by result."""
-    inner, every = called_jaxpr(eqn), union(flags)
-    if every and inner is not None:
+    inner, combined = called_jaxpr(eqn), union(flags)
+    if combined and inner is not None:
         return dependence(open_jaxpr(inner)[0], flags)
-    match eqn.primitive.name if every else "":
+    match eqn.primitive.name if combined else "":
         case "cond":
             return branch_dependence(eqn.params["branches"], flags[0], flags[1:])
         case "scan":
             return scan_dependence(eqn.params["jaxpr"].jaxpr, *split_scan_operands(eqn.params, flags))
         case "while":
             return while_dependence(*unpack_while(eqn, flags))[0]
-    return [every] * len(eqn.outvars)
+    return [combined] * len(eqn.outvars)

@@ -25,8 +25,8 @@ from ptsmc_jax.batching.components import TRIAL, BatchedArray
 from ptsmc_jax.batching.dependence import split_scan_operands
 
 BLOCK = 128  # trials in a block, a power of two
-UNROLLED = 8  # length of the longest loop that is unrolled
-MAPPED = 256  # length of the longest loop without carries that is unrolled; its results are stacked
+UNROLL_LIMIT = 8  # length of the longest loop that is unrolled
+STACK_LIMIT = 256  # length of the longest loop without carries that is unrolled; its results are stacked
 MAX_COMPONENTS = 1024  # entries of the largest array; all arrays are split into components
 
 _CUSTOM_CALLS = ("custom_jvp_call", "custom_vjp_call")  # inlined: derivatives are taken before the kernel is built
@@ -60,7 +60,9 @@ def scan(
     """
     body, length, inputs = params["jaxpr"], params["length"], params["jaxpr"].jaxpr.invars
     carries, xs = split_scan_operands(params, inputs)[1], split_scan_operands(params, values)[2]
-    unsuitable = length <= UNROLLED or params["reverse"] or len(body.jaxpr.outvars) > len(carries) or not any(varies)
+    unsuitable = (
+        length <= UNROLL_LIMIT or params["reverse"] or len(body.jaxpr.outvars) > len(carries) or not any(varies)
+    )
     if unsuitable or 0 in batch or any(x.axes & TRIAL for x in xs):
         return None
     *directions, trials = batch
@@ -77,8 +79,8 @@ def scan(
         number_refs, row_refs, end_refs = ({kind: next(remaining) for kind in t.parts} for t in (numbers, rows, ends))
         vectors = {kind: _load_rows(ref, rows.sizes[kind]) for kind, ref in row_refs.items()}
 
-        def operand(value: BatchedArray, stored: _Stored) -> Any:
-            return stored.open(vectors).load() if value.axes & TRIAL else stored.open(number_refs)
+        def operand(value: BatchedArray, stored: _StoredArray) -> Any:
+            return stored.in_tables(vectors).load() if value.axes & TRIAL else stored.in_tables(number_refs)
 
         operands = list(map(operand, values, operand_slots))
         last = _Interpreter(interpreted).loop(body, length, split_scan_operands(params, operands), varies)
@@ -94,7 +96,7 @@ def scan(
         return [pl.BlockSpec((height, BLOCK), lambda block, direction: (direction, block)) for height in heights]
 
     flat, width = numbers.number_arrays(), blocks * BLOCK
-    found = pl.pallas_call(
+    end_tables = pl.pallas_call(
         run,
         out_shape=[
             jax.ShapeDtypeStruct((count * _next_power_of_two(size), width), kind) for kind, size in ends.sizes.items()
@@ -107,9 +109,9 @@ def scan(
     )(*flat, *rows.row_arrays(batch, width))
     by_row = {
         kind: jnp.moveaxis(table.reshape(*directions, -1, width)[..., :trials], -2, 0)
-        for kind, table in zip(ends.parts, found, strict=True)
+        for kind, table in zip(ends.parts, end_tables, strict=True)
     }
-    return [stored.open(by_row).load().components for stored in end_slots]
+    return [stored.in_tables(by_row).load().components for stored in end_slots]
 
 
 def _next_power_of_two(length: int) -> int:
@@ -120,7 +122,7 @@ def _next_power_of_two(length: int) -> int:
 def _table_dtype(dtype: Any) -> str:
     """Return the dtype of the table that holds numbers of this dtype."""
     if str(dtype) not in _DTYPES:
-        raise NotImplementedError(f"a kernel holds nothing of the type {dtype}")
+        raise NotImplementedError(f"a kernel cannot hold values of the type {dtype}")
     return "int32" if dtype == np.dtype(bool) else str(dtype)
 
 
@@ -129,7 +131,7 @@ def _check_size(shape: tuple[int, ...]) -> None:
         raise NotImplementedError(f"a kernel splits arrays of at most {MAX_COMPONENTS} entries")
 
 
-class _Stored(NamedTuple):
+class _StoredArray(NamedTuple):
     """An array in the table of one dtype. It is loaded where it is used.
 
     Args:
@@ -148,7 +150,7 @@ class _Stored(NamedTuple):
     dtype: Any
     table: Any = None
 
-    def open(self, tables: dict[str, Any]) -> "_Stored":
+    def in_tables(self, tables: dict[str, Any]) -> "_StoredArray":
         """Return the array in these tables, by dtype, of the direction that the kernel computes."""
         start = np.int32(self.start)
         if self.stride:
@@ -174,22 +176,22 @@ class _Tables:
         self.parts: dict[str, list] = {}
         self.sizes: dict[str, int] = {}
 
-    def add(self, parts: Sequence, size: int, shape: tuple[int, ...], dtype: Any, stride: int = 0) -> _Stored:
+    def add(self, parts: Sequence, size: int, shape: tuple[int, ...], dtype: Any, stride: int = 0) -> _StoredArray:
         """Append the entries of an array, `size` of them. A table without entries is not created."""
         kind = _table_dtype(dtype)
         start = self.sizes.get(kind, 0)
         if size:
             self.parts.setdefault(kind, []).extend(parts)
             self.sizes[kind] = start + size
-        return _Stored(kind, start, stride, shape, dtype)
+        return _StoredArray(kind, start, stride, shape, dtype)
 
-    def add_rows(self, value: BatchedArray, dtype: Any) -> _Stored:
+    def add_rows(self, value: BatchedArray, dtype: Any) -> _StoredArray:
         """Append a row for each component of a value that differs by trial."""
         _check_size(value.shape)
         parts = value.components
         return self.add(list(parts.flat), parts.size, value.shape, dtype)
 
-    def add_numbers(self, value: BatchedArray, dtype: Any, directions: int) -> _Stored:
+    def add_numbers(self, value: BatchedArray, dtype: Any, directions: int) -> _StoredArray:
         """Append the entries of a value that is equal in all trials, for each direction if it differs by direction."""
         array = jnp.ravel(value.to_array((directions, 1) if value.axes else ())).astype(_table_dtype(dtype))
         return self.add([array], array.size, value.shape, dtype, math.prod(value.shape) if value.axes else 0)
@@ -219,9 +221,9 @@ class _Tables:
 def _load_rows(ref: Any, count: int) -> Sequence:
     """Return the first rows of a table."""
 
-    def step(k: Any, found: tuple) -> tuple:
+    def step(k: Any, loaded: tuple) -> tuple:
         row = ref[k, :]
-        return tuple(jnp.where(k == np.int32(i), row, value) for i, value in enumerate(found))
+        return tuple(jnp.where(k == np.int32(i), row, value) for i, value in enumerate(loaded))
 
     empty = jnp.zeros((ref.shape[1],), ref.dtype)
     return lax.fori_loop(np.int32(0), np.int32(count), step, (empty,) * count)
@@ -231,14 +233,14 @@ def _store_rows(ref: Any, rows: Sequence) -> None:
     """Store the first rows of a table."""
 
     def step(k: Any, _: None) -> None:
-        ref[k, :] = _choose(k, *rows)
+        ref[k, :] = _select(k, *rows)
 
     lax.fori_loop(np.int32(0), np.int32(len(rows)), step, None)
 
 
-def _choose(k: Any, *values: Any) -> Any:
+def _select(k: Any, *values: Any) -> Any:
     """Return the k-th value, for an index that is known in the kernel only."""
-    return reduce(lambda found, i: jnp.where(k == np.int32(i), values[i], found), range(1, len(values)), values[0])
+    return reduce(lambda value, i: jnp.where(k == np.int32(i), values[i], value), range(1, len(values)), values[0])
 
 
 # The maximum of NaN and a number is the number in Triton, so that a torque limit would hide a diverged trial.
@@ -256,7 +258,7 @@ _REPLACEMENTS = {
     "max": _maximum,
     "min": _minimum,
     "clamp": lambda low, value, high: _minimum(_maximum(low, value), high),
-    "select_n": _choose,
+    "select_n": _select,
 }
 
 
@@ -299,8 +301,8 @@ class _Interpreter:
             with jax.ensure_compile_time_eval():
                 return [_to_constant(out) for out in components.bind(eqn, arrays)]
         # new rules for each equation: an array that was broadcast inside a branch or loop must not leave it
-        two_cases = name == "select_n" and len(values) == 3
-        rules = components.ComponentRules(MAX_COMPONENTS, {} if two_cases else _REPLACEMENTS)
+        has_two_cases = name == "select_n" and len(values) == 3
+        rules = components.ComponentRules(MAX_COMPONENTS, {} if has_two_cases else _REPLACEMENTS)
         results = rules.apply(eqn, values)
         if results is None:
             raise NotImplementedError(
@@ -314,8 +316,8 @@ class _Interpreter:
         consts, init, xs = split_scan_operands(params, values)
         consts, state, count = _load_all(consts), _load_all(init), len(init)
         if params["reverse"]:
-            raise NotImplementedError("a kernel's loops run forward")
-        if length <= UNROLLED or (count == 0 and length <= MAPPED):
+            raise NotImplementedError("a kernel cannot run a loop backward")
+        if length <= UNROLL_LIMIT or (count == 0 and length <= STACK_LIMIT):
             steps: list[list] = []
             for k in range(length):
                 steps.append(self.evaluate(body, [*consts, *state, *(_take_row(x, k) for x in xs)]))
@@ -324,7 +326,7 @@ class _Interpreter:
             rows = (((length, *v.aval.shape), [step[j].parts for step in steps]) for j, v in outputs)
             return [*state, *(BatchedArray(shape, tuple(itertools.chain(*parts))) for shape, parts in rows)]
         if len(body.jaxpr.outvars) > count:
-            raise NotImplementedError(f"a kernel stacks no results of {length} steps")
+            raise NotImplementedError(f"a kernel cannot stack the results of {length} steps")
         operands = consts, state, xs
         return self.loop(body, length, operands, dependence.scan_dependence(body.jaxpr, *map(_vary_by_trial, operands)))
 
@@ -345,16 +347,16 @@ class _Interpreter:
         if np.ndim(index) == 0:
             return lax.cond(index, cases[1], cases[0]) if index.dtype == bool else lax.switch(index, cases)
         which = index if index.dtype == bool else jnp.clip(index, 0, len(branches) - 1)
-        return jax.tree.map(lambda *each: _choose(which, *each), *(case() for case in cases))
+        return jax.tree.map(lambda *each: _select(which, *each), *(case() for case in cases))
 
     def align(self, values: Sequence[BatchedArray], varies: Sequence[int]) -> list[BatchedArray]:
         """Return values as loops and branches carry them: vectors if they differ by trial, otherwise scalars."""
 
-        def align_one(value: BatchedArray, each: int) -> BatchedArray:
-            def component(part: Any) -> Any:  # Triton cannot return constants; select makes a scalar of them
-                return jnp.broadcast_to(part, (BLOCK,)) if each else lax.select(True, part, part)
+        def align_one(value: BatchedArray, varies_by_trial: int) -> BatchedArray:
+            def to_component(part: Any) -> Any:  # Triton cannot return constants; select makes a scalar of them
+                return jnp.broadcast_to(part, (BLOCK,)) if varies_by_trial else lax.select(True, part, part)
 
-            return BatchedArray(value.shape, tuple(map(component, value.components.flat)))
+            return BatchedArray(value.shape, tuple(map(to_component, value.components.flat)))
 
         return [align_one(*item) for item in zip(values, varies, strict=False)]
 
@@ -369,15 +371,15 @@ def _is_constant(value: BatchedArray) -> bool:
 
 
 def _load_all(values: Sequence) -> list[BatchedArray]:
-    return [value.load() if isinstance(value, _Stored) else value for value in values]
+    return [value.load() if isinstance(value, _StoredArray) else value for value in values]
 
 
 def _take_row(value: Any, k: Any) -> BatchedArray:
     """Return the row of xs that step k of a loop takes."""
-    if isinstance(value, _Stored):
+    if isinstance(value, _StoredArray):
         return value.row(k)
     shape, rows = value.shape[1:], value.components.reshape(value.shape[0], -1)
-    parts = rows[k] if isinstance(k, int) else (_choose(k, *each) for each in rows.T)
+    parts = rows[k] if isinstance(k, int) else (_select(k, *each) for each in rows.T)
     return BatchedArray(shape, tuple(parts))
 
 

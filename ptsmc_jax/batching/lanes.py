@@ -60,8 +60,8 @@ def vmap(function: Callable, in_axes: Any = 0, *, strict: bool = False, kernel: 
     """
 
     def mapped(*args: Any) -> Any:
-        trials, one, values = _batched_arguments(args, in_axes)
-        closed, out = jax.make_jaxpr(function, return_shape=True)(*one)
+        trials, one_trial, values = _batched_arguments(args, in_axes)
+        closed, out = jax.make_jaxpr(function, return_shape=True)(*one_trial)
         results = _Interpreter(trials, strict, use_kernel=kernel).evaluate(
             dependence.eliminate_dead_code(closed), values
         )
@@ -91,22 +91,24 @@ def jvp(function: Callable, in_axes: Any = 0, *, kernel: bool = False) -> Callab
     """
 
     def mapped(args: tuple, directions: tuple) -> tuple[Any, Any]:
-        trials, one, values = _batched_arguments(args, in_axes)
-        moving = [k for k, along in enumerate(directions) if along is not None]
-        if not moving or len(directions) > len(args):
-            raise ValueError(f"directions must be of some of the {len(args)} arguments, found {len(moving)}")
+        trials, one_trial, values = _batched_arguments(args, in_axes)
+        active = [k for k, along in enumerate(directions) if along is not None]
+        if not active or len(directions) > len(args):
+            raise ValueError(f"directions must be of some of the {len(args)} arguments, found {len(active)}")
 
-        def value_and_tangent(one: tuple, tangents: tuple) -> tuple[Any, Any]:
-            def of_moving(*some: Any) -> Any:
-                return function(*(dict(enumerate(one)) | dict(zip(moving, some, strict=True))).values())
+        def value_and_tangent(one_trial: tuple, tangents: tuple) -> tuple[Any, Any]:
+            def apply_to_active(*replacements: Any) -> Any:
+                return function(*(dict(enumerate(one_trial)) | dict(zip(active, replacements, strict=True))).values())
 
-            return jax.jvp(of_moving, tuple(one[k] for k in moving), tangents)
+            return jax.jvp(apply_to_active, tuple(one_trial[k] for k in active), tangents)
 
         along = [jnp.asarray(leaf) for leaf in jax.tree.leaves(directions)]
-        closed, out = jax.make_jaxpr(value_and_tangent, return_shape=True)(one, tuple(one[k] for k in moving))
+        closed, out = jax.make_jaxpr(value_and_tangent, return_shape=True)(
+            one_trial, tuple(one_trial[k] for k in active)
+        )
         shapes = [v.aval.shape for v in closed.jaxpr.invars[len(values) :]]
         count = along[0].shape[0] if along[0].ndim else 0
-        values += [_tangent(leaf, shape, count, trials) for leaf, shape in zip(along, shapes, strict=True)]
+        values += [_batch_directions(leaf, shape, count, trials) for leaf, shape in zip(along, shapes, strict=True)]
         results = _Interpreter(trials, False, count, kernel).evaluate(dependence.eliminate_dead_code(closed), values)
         half = len(results) // 2
         batches = [(trials,)] * half + [(count, trials)] * half
@@ -127,9 +129,9 @@ def _batched_arguments(args: tuple, in_axes: Any) -> tuple[int, tuple, list[Batc
     sizes = {leaf.shape[0] for leaf, on in leaves if on}
     if len(sizes) != 1:
         raise ValueError(f"the mapped arguments must share one number of trials, found {sorted(sizes)}")
-    one = [jax.ShapeDtypeStruct(v.shape[on:], v.dtype, weak_type=jax.typeof(v).weak_type) for v, on in leaves]
+    one_trial = [jax.ShapeDtypeStruct(v.shape[on:], v.dtype, weak_type=jax.typeof(v).weak_type) for v, on in leaves]
     values = [BatchedArray(v.shape[1:], array=v).split() if on else BatchedArray.unbatched(v) for v, on in leaves]
-    return sizes.pop(), jax.tree.unflatten(tree, one), values
+    return sizes.pop(), jax.tree.unflatten(tree, one_trial), values
 
 
 def _is_mapped(axis: int | None) -> bool:
@@ -138,7 +140,7 @@ def _is_mapped(axis: int | None) -> bool:
     return axis == 0
 
 
-def _tangent(along: Array, shape: tuple[int, ...], count: int, trials: int) -> BatchedArray:
+def _batch_directions(along: Array, shape: tuple[int, ...], count: int, trials: int) -> BatchedArray:
     """Return directions (count, *shape) or (count, trials, *shape) of a value of this shape."""
     if along.shape == (count, *shape):
         return BatchedArray(shape, array=along[:, None], axes=DIRECTION).split()
@@ -169,7 +171,7 @@ class _Interpreter:
         return dependence.interpret(jaxpr, consts, arguments, BatchedArray.unbatched, self.apply)
 
     def evaluate_inside(self, closed: Any, arguments: Sequence[BatchedArray]) -> list[BatchedArray]:
-        """Return the outputs of a jaxpr inside a function that JAX traces, by an interpreter of its own.
+        """Return the outputs of a jaxpr inside a function that JAX traces, by a separate interpreter.
 
         Arrays of the inner trace must not be stored in this interpreter.
         """
@@ -242,10 +244,10 @@ class _Interpreter:
         """Return the results of `lax.scan`."""
         params, body = eqn.params, eqn.params["jaxpr"]
         consts, init, xs = dependence.split_scan_operands(params, values)
-        consts, count = _split(consts), len(init)
+        consts, count = _split_all(consts), len(init)
         axes = dependence.scan_dependence(body.jaxpr, *map(_axes, (consts, init, xs)))
         if self.use_kernel:
-            last = self.scan_in_kernel(params, [*consts, *_split(init), *xs], axes[:count])
+            last = self.scan_in_kernel(params, [*consts, *_split_all(init), *xs], axes[:count])
             if last is not None:
                 return last
 
@@ -293,22 +295,22 @@ class _Interpreter:
             warnings.warn(f"a loop runs step by step, which may be slow: {error}", LanesWarning, stacklevel=2)
             return None
 
-        def of_carry(parts: np.ndarray, axes: int) -> BatchedArray:
+        def to_carry(parts: np.ndarray, axes: int) -> BatchedArray:
             """Return a carry with its batch axes: the kernel computes each for each direction and trial."""
 
-            def of_batch(part: Array) -> Array:
+            def select_axes(part: Array) -> Array:
                 part = part if axes & DIRECTION or part.ndim == 1 else part[0]
                 return part if axes & TRIAL else part[..., :1] if axes else part[0]
 
             axes = axes if parts.size else TRIAL
-            return self._align_one(jax.tree.map(of_batch, BatchedArray.of_components(parts, axes)), axes)
+            return self._align_one(jax.tree.map(select_axes, BatchedArray.of_components(parts, axes)), axes)
 
-        return last and list(map(of_carry, last, axes))
+        return last and list(map(to_carry, last, axes))
 
     def while_loop(self, eqn: Any, values: list[BatchedArray]) -> list[BatchedArray]:
         """Return the results of `lax.while_loop`. A trial whose test is false keeps its carries."""
         test, body, test_consts, body_consts, init = dependence.unpack_while(eqn, values)
-        test_consts, body_consts = _split(test_consts), _split(body_consts)
+        test_consts, body_consts = _split_all(test_consts), _split_all(body_consts)
         axes, test_axes = dependence.while_dependence(test, body, *map(_axes, (test_consts, body_consts, init)))
 
         def is_running(carry: list) -> Any:
@@ -319,8 +321,8 @@ class _Interpreter:
             after = self.align(self.evaluate_inside(body, [*body_consts, *carry]), axes)
             if not test_axes:
                 return after
-            on = is_running(carry)
-            return [self._map_leaves(jnp.where, on, new, old) for new, old in zip(after, carry, strict=True)]
+            running = is_running(carry)
+            return [self._map_leaves(jnp.where, running, new, old) for new, old in zip(after, carry, strict=True)]
 
         proceed = (lambda carry: jnp.any(is_running(carry))) if test_axes else is_running
         return lax.while_loop(proceed, step, self.align(init, axes))
@@ -335,26 +337,28 @@ class _Interpreter:
         """
         batch_axes = len(self.batch_shapes[values[0].axes])
 
-        def of_leaf(*leaves: Array) -> Array:
+        def apply_to_leaf(*leaves: Array) -> Array:
             return function(condition.reshape(condition.shape + (1,) * (leaves[0].ndim - batch_axes)), *leaves)
 
-        return jax.tree.map(of_leaf, *values)
+        return jax.tree.map(apply_to_leaf, *values)
 
     def cond(self, eqn: Any, values: list[BatchedArray]) -> list[BatchedArray]:
         """Return the results of `lax.cond` and `lax.switch`: of all branches if trials differ in the index."""
         index, *operands = values
         branches = eqn.params["branches"]
-        operands = operands if index.axes else _split(operands)
+        operands = operands if index.axes else _split_all(operands)
         axes = dependence.branch_dependence(branches, index.axes, _axes(operands))
 
-        def case(branch: Any, operands: Sequence[BatchedArray]) -> list[BatchedArray]:
+        def run_branch(branch: Any, operands: Sequence[BatchedArray]) -> list[BatchedArray]:
             return self.align(self.evaluate_inside(branch, operands), axes)
 
         if not index.axes:
-            return lax.switch(index.array, [partial(case, branch, operands) for branch in branches])
+            return lax.switch(index.array, [partial(run_branch, branch, operands) for branch in branches])
         which = index.to_array(self.batch_shapes[index.axes])
         which = which if which.dtype == bool else jnp.clip(which, 0, len(branches) - 1)
-        cases = [case(branch, self._stop_gradients(eqn, operands, which == k)) for k, branch in enumerate(branches)]
+        cases = [
+            run_branch(branch, self._stop_gradients(eqn, operands, which == k)) for k, branch in enumerate(branches)
+        ]
 
         def choose(which: Array, *leaves: Array) -> Array:
             return lax.select_n(jnp.broadcast_to(which, leaves[0].shape), *leaves)
@@ -384,11 +388,11 @@ class _Interpreter:
         axes = [union(_axes(values))] * len(eqn.outvars)
 
         def value_and_tangent(primals: list, tangents: list) -> tuple:
-            def of_inexact(some: list) -> Sequence:
-                operands = dict(enumerate(primals)) | dict(zip(inexact, some, strict=True))
+            def apply_to_inexact(inexact_operands: list) -> Sequence:
+                operands = dict(enumerate(primals)) | dict(zip(inexact, inexact_operands, strict=True))
                 return components.bind(eqn, list(operands.values()))
 
-            return jax.jvp(of_inexact, ([primals[k] for k in inexact],), (tangents,))
+            return jax.jvp(apply_to_inexact, ([primals[k] for k in inexact],), (tangents,))
 
         @jax.custom_jvp
         def function(operands: list) -> list:
@@ -413,7 +417,7 @@ def _axes(values: Sequence[BatchedArray]) -> list[int]:
     return [value.axes for value in values]
 
 
-def _split(values: Sequence[BatchedArray]) -> list[BatchedArray]:
+def _split_all(values: Sequence[BatchedArray]) -> list[BatchedArray]:
     """Return operands of a loop or branch, split into components outside of it."""
     return [value if value.axes == DIRECTION else value.split() for value in values]
 

@@ -19,8 +19,8 @@ from ptsmc_jax import configure
 CAN_DEADLOCK = jaxlib.version.__version_info__ < (0, 11)
 # jaxlib 0.10.2 splits a call among threads from about 2e5 operations (matrices times order^3) on
 MAX_BATCHED_OPERATIONS = 1 << 16
-COUNTED = frozenset(("lu", "cholesky", "triangular_solve"))  # primitives that may be batched up to this limit
-SHARED = frozenset(
+SIZE_LIMITED = frozenset(("lu", "cholesky", "triangular_solve"))  # primitives that may be batched up to this limit
+NEVER_BATCHED = frozenset(
     """cholesky_update eig eigh geqp3 geqrf hessenberg householder_product ormqr qr schur svd tridiagonal
     tridiagonal_solve""".split()
 )  # primitives that are never batched: jaxlib shares two matrices already, as in eigh, or the limit is not known
@@ -31,8 +31,8 @@ def vmap(function: Callable) -> Callable:
 
     def mapped(*args: Any) -> Any:
         leaves = jax.tree.leaves(args)
-        one = jax.tree.map(lambda v: jax.ShapeDtypeStruct(v.shape[1:], v.dtype), args)
-        closed, out = jax.make_jaxpr(function, return_shape=True)(*one)
+        element = jax.tree.map(lambda v: jax.ShapeDtypeStruct(v.shape[1:], v.dtype), args)
+        closed, out = jax.make_jaxpr(function, return_shape=True)(*element)
         transform = choose_vmap(closed.jaxpr.eqns, leaves[0].shape[0])
         results = transform(core.jaxpr_as_fun(closed), [0] * len(leaves))(*leaves)
         return jax.tree.unflatten(jax.tree.structure(out), results)
@@ -51,11 +51,11 @@ def sequential_map(function: Callable, in_axes: Sequence[int | None]) -> Callabl
     """Return `jax.vmap(function, in_axes)` as a loop over the elements of the batch. Axes are 0 or None."""
 
     def mapped(*args: Any) -> Any:
-        def one(row: list) -> Any:
-            rows = iter(row)
-            return function(*(v if axis is None else next(rows) for v, axis in zip(args, in_axes, strict=True)))
+        def evaluate_element(mapped_values: list) -> Any:
+            remaining = iter(mapped_values)
+            return function(*(v if axis is None else next(remaining) for v, axis in zip(args, in_axes, strict=True)))
 
-        return lax.map(one, [v for v, axis in zip(args, in_axes, strict=True) if axis is not None])
+        return lax.map(evaluate_element, [v for v, axis in zip(args, in_axes, strict=True) if axis is not None])
 
     return mapped
 
@@ -63,12 +63,12 @@ def sequential_map(function: Callable, in_axes: Sequence[int | None]) -> Callabl
 def _operations(equations: Sequence) -> float:
     """Return the number of operations of the largest LAPACK call; infinity if a call must never be batched."""
 
-    def of_one(eqn: Any) -> float:
+    def count_operations(eqn: Any) -> float:
         name, shapes = eqn.primitive.name, [v.aval.shape for v in eqn.invars]
-        if name in SHARED:
+        if name in NEVER_BATCHED:
             return np.inf
-        if name in COUNTED:
+        if name in SIZE_LIMITED:
             return float(np.prod(shapes[-1]) * max(shapes[0][-2:]))
         return max((_operations(inner.eqns) for inner in core.jaxprs_in_params(eqn.params)), default=0.0)
 
-    return max(map(of_one, equations), default=0.0)
+    return max(map(count_operations, equations), default=0.0)

@@ -27,7 +27,7 @@ from ptsmc_jax.dispersions.table_rows import Row
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.scenario import Study, custom_checks
 from ptsmc_jax.simulation import requirements, rollout
-from ptsmc_jax.simulation.computer import OURS, Software
+from ptsmc_jax.simulation.computer import PYTHON_SOFTWARE, Software
 from ptsmc_jax.simulation.requirements import Requirement, Verdict
 from ptsmc_jax.simulation.rollout import Parts
 
@@ -42,13 +42,13 @@ class Campaign:
 
     ready: Study
     seed: int
-    custom_metrics: CustomMetrics | None = None  # custom metrics
-    run_table: RunTable | None = None  # run table with a row for each trial
-    software: Software = OURS  # the flight computer
+    custom_metrics: CustomMetrics | None = None
+    run_table: RunTable | None = None  # a row for each trial
+    software: Software = PYTHON_SOFTWARE  # the flight computer
 
     @property
     def table_sets_values(self) -> bool:
-        """Whether a run table sets anything."""
+        """Whether the campaign has a run table that sets a quantity."""
         return self.run_table is not None and bool(self.run_table.given)
 
     def rows(self, trials: np.ndarray) -> np.ndarray | Row:
@@ -71,7 +71,7 @@ class Campaign:
             "bad_time": simulated.bad_time,
             **self._origin(wanted),
             **{name: getattr(simulated.metrics, name) for name in self.ready.catalogue},
-            **_counted(simulated.samples),
+            **_sample_counts(simulated.samples),
             **simulated.drawn,
             **simulated.custom_metrics,
         })  # fmt: skip
@@ -90,42 +90,46 @@ class Campaign:
 
     def custom_metric_names(self) -> list[str]:
         """Return the names of the custom metrics. Raises ValueError if they fail or a row cannot hold them."""
-        made = self.custom_metrics
-        if made is None:
+        function = self.custom_metrics
+        if function is None:
             return []
 
-        def asked(result: rollout.Result, parts: Parts) -> dict[str, jax.Array]:
+        def call_and_check(result: rollout.Result, parts: Parts) -> dict[str, jax.Array]:
             try:
-                returned: Any = made(result, parts)
+                returned: Any = function(result, parts)
             except (Exception, SystemExit) as error:
-                file = getattr(getattr(made, "__code__", None), "co_filename", "")
-                raise ValueError(f"it {custom_checks.what_fails(error, file)}") from error
+                file = getattr(getattr(function, "__code__", None), "co_filename", "")
+                raise ValueError(f"it {custom_checks.describe_failure(error, file)}") from error
             if not isinstance(returned, dict) or not returned or not all(isinstance(name, str) for name in returned):
-                what = "an empty dict" if isinstance(returned, dict) and not returned else type(returned).__name__
-                raise ValueError(f"it returns {what}, but must return named numbers, a dict")
+                returned_type = (
+                    "an empty dict" if isinstance(returned, dict) and not returned else type(returned).__name__
+                )
+                raise ValueError(f"it returns {returned_type}, but must return named numbers, a dict")
             for name, value in returned.items():
-                single = isinstance(value, int | float | np.generic | np.ndarray | jax.Array) and not np.ndim(value)
-                if not single or jnp.result_type(value).kind not in "iuf":
+                is_single = isinstance(value, int | float | np.generic | np.ndarray | jax.Array) and not np.ndim(value)
+                if not is_single or jnp.result_type(value).kind not in "iuf":
                     raise ValueError(f"its {name} is no single number")
             return returned
 
-        about = self.ready.parts, self.ready.dispersion, self.seed, 0
-        simulated = jax.eval_shape(lambda: montecarlo.one(*about, custom_metrics=asked, software=self.software))
-        counted = _counted(simulated.samples)
+        arguments = self.ready.parts, self.ready.dispersion, self.seed, 0
+        simulated = jax.eval_shape(
+            lambda: montecarlo.one(*arguments, custom_metrics=call_and_check, software=self.software)
+        )
+        counts = _sample_counts(simulated.samples)
         for name in simulated.custom_metrics:
-            if not custom_checks.names_column(name):
+            if not custom_checks.is_column_name(name):
                 raise ValueError(f"its {name!r} is no name of a column; allowed are names that can be printed")
-            if name in {"trial", *run_tables.OF_ROWS.values(), *run_tables.RESULTS, *counted, *simulated.drawn}:
+            if name in {"trial", *run_tables.OF_ROWS.values(), *run_tables.RESULTS, *counts, *simulated.drawn}:
                 raise ValueError(f"its {name} has the name of a column that the rows have already")
         return list(simulated.custom_metrics)
 
 
-def _counted(samples: dict[str, Any]) -> dict[str, Any]:
+def _sample_counts(samples: dict[str, Any]) -> dict[str, Any]:
     """Return the numbers of samples by status, by column."""
-    return {f"{run_tables.COUNTED}{status}": count for status, count in samples.items()}
+    return {f"{run_tables.COUNT_PREFIX}{status}": count for status, count in samples.items()}
 
 
-def of_run_table(
+def from_run_table(
     ready: Study,
     seed: int,
     table: RunTable,
@@ -147,22 +151,22 @@ def of_run_table(
     Raises:
         RefusedError: initial angles or numbers of custom dispersions are not those of the trials.
     """
-    kinds = {*ready.dispersion.kinds, RATE_BIAS}
-    same = []  # quantities that have the same values with and without the table
+    dispersed = {*ready.dispersion.kinds, RATE_BIAS}
+    unchanged = []  # quantities that have the same values with and without the table
     drawn = None  # the quantities of the trials without a table
     for name, values in table.given.items():
         quantity = QUANTITIES[name]
-        columns, usual = quantity.columns(ready.parts), np.asarray(quantity.read(ready.parts))[None]
-        if not kinds.isdisjoint({name, CUSTOM}):  # a custom dispersion may change any quantity
+        columns, usual_values = quantity.columns(ready.parts), np.asarray(quantity.read(ready.parts))[None]
+        if not dispersed.isdisjoint({name, CUSTOM}):  # a custom dispersion may change any quantity
             if drawn is None:
                 drawn = Campaign(ready, seed, custom_metrics, table.without(table.given)).draw(range(table.count))
             if set(columns) <= set(drawn.columns):
-                usual = drawn.select(columns).to_numpy()
-            elif name in kinds:
-                usual = np.zeros_like(values)
-        if np.array_equal(np.broadcast_to(usual, values.shape), values):
-            same.append(name)
-    campaign = Campaign(ready, seed, custom_metrics, table.without(same))
+                usual_values = drawn.select(columns).to_numpy()
+            elif name in dispersed:
+                usual_values = np.zeros_like(values)
+        if np.array_equal(np.broadcast_to(usual_values, values.shape), values):
+            unchanged.append(name)
+    campaign = Campaign(ready, seed, custom_metrics, table.without(unchanged))
     if table.angle is not None or table.custom:
         rows = drawn if drawn is not None and not campaign.table_sets_values else campaign.draw(range(table.count))
         run_tables.check_custom_numbers(table.custom, rows, where)
@@ -176,7 +180,7 @@ def _draw(parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Arr
     return lanes.vmap(lambda trial: montecarlo.values(parts, dispersion, seed, trial))(trials)
 
 
-def missing(parts: Iterable[Part], trials: int, shard: tuple[int, int] = (1, 1)) -> list[Block]:
+def missing_parts(parts: Iterable[Part], trials: int, shard: tuple[int, int] = (1, 1)) -> list[Block]:
     """Return the parts that a campaign still needs.
 
     Args:
@@ -184,16 +188,16 @@ def missing(parts: Iterable[Part], trials: int, shard: tuple[int, int] = (1, 1))
         trials: number of trials of the campaign.
         shard: (i, n) selects every n-th part, from the i-th.
     """
-    there = {part.first: part.count for part in parts}
-    every = [(first, min(PART, trials - first)) for first in range(0, trials, PART)]
+    counts = {part.first: part.count for part in parts}
+    all_parts = [(first, min(PART, trials - first)) for first in range(0, trials, PART)]
     number, shards = shard
-    return [(first, count) for first, count in every[number - 1 :: shards] if there.get(first, 0) < count]
+    return [(first, count) for first, count in all_parts[number - 1 :: shards] if counts.get(first, 0) < count]
 
 
 def kept_parts(parts: Iterable[Part], wanted: Iterable[Block]) -> list[Part]:
     """Return the parts on disk that are not simulated again."""
-    again = {first for first, _ in wanted}
-    return [part for part in parts if part.first not in again]
+    simulated_again = {first for first, _ in wanted}
+    return [part for part in parts if part.first not in simulated_again]
 
 
 @dataclass
@@ -205,77 +209,77 @@ class Tally:
     failed: int  # number of failed trials
 
 
-def tally(parts: list[Part], total: int) -> Tally:
-    """Return the progress of a campaign with these parts."""
-    failed = sum(failures(read([part], ["status"])) for part in parts)
+def count_progress(parts: list[Part], total: int) -> Tally:
+    """Return the progress of a campaign whose parts on disk are these."""
+    failed = sum(count_failures(read([part], ["status"])) for part in parts)
     return Tally(sum(part.count for part in parts), total, failed)
 
 
-def failures(frame: pl.DataFrame) -> int:
+def count_failures(frame: pl.DataFrame) -> int:
     """Return the number of failed trials in these rows."""
     return int((frame["status"] != "ok").sum())
 
 
-def finished(frame: pl.DataFrame) -> np.ndarray:
-    """Return which trials reached the end, (trials,) bool; the metrics of the others are not those of a whole run."""
+def has_finished(frame: pl.DataFrame) -> np.ndarray:
+    """Return which trials reached the end, (trials,) bool. Metrics of other trials cover only a part of the run."""
     return frame["status"].is_in(montecarlo.FINISHED).to_numpy()
 
 
 def verdicts(asked: Iterable[Requirement], frame: pl.DataFrame) -> list[Verdict]:
     """Return the verdict of each requirement over these rows; a failed trial violates all requirements."""
-    return requirements.verdicts(asked, lambda name: frame[name].to_numpy().astype(float), finished(frame))
+    return requirements.verdicts(asked, lambda name: frame[name].to_numpy().astype(float), has_finished(frame))
 
 
 def make_parts(
-    make: Callable[[np.ndarray], pl.DataFrame], rows: Rows, wanted: list[Block]
+    simulate: Callable[[np.ndarray], pl.DataFrame], rows: Rows, wanted: list[Block]
 ) -> Iterator[tuple[Part, int]]:
     """Make the wanted parts on this machine and write them. Accelerators make several parts at a time.
 
     Args:
-        make: returns the rows of trials, by their numbers.
+        simulate: returns the rows of trials, by their numbers.
         rows: the place for the parts.
         wanted: the parts, in order.
 
     Yields:
         Each part that is written, and its number of failed trials.
     """
-    together = max(1, montecarlo.block_size() * len(configure.devices()) // PART)
-    groups = [wanted[k : k + together] for k in range(0, len(wanted), together)]
+    parts_per_group = max(1, montecarlo.block_size() * len(configure.devices()) // PART)
+    groups = [wanted[k : k + parts_per_group] for k in range(0, len(wanted), parts_per_group)]
 
-    def made(group: list[Block]) -> list[tuple[Part, int]]:
-        frame = make(np.concatenate([np.arange(first, first + count) for first, count in group]))
-        parts, begin = [], 0
+    def make_group(group: list[Block]) -> list[tuple[Part, int]]:
+        frame = simulate(np.concatenate([np.arange(first, first + count) for first, count in group]))
+        parts, first_row = [], 0
         for first, count in group:
-            part = frame.slice(begin, count)
-            begin += count
-            parts.append((rows.write(first, part), failures(part) if "status" in part.columns else 0))
+            part = frame.slice(first_row, count)
+            first_row += count
+            parts.append((rows.write(first, part), count_failures(part) if "status" in part.columns else 0))
         return parts
 
     workers = ThreadPoolExecutor(2)  # one thread simulates while the other makes and writes rows
     try:
         for group in groups[:1]:
-            yield from made(group)  # the first group runs alone, since it compiles the program
-        for parts in workers.map(made, groups[1:]):
+            yield from make_group(group)  # the first group runs alone, since it compiles the program
+        for parts in workers.map(make_group, groups[1:]):
             yield from parts
     finally:
         workers.shutdown(cancel_futures=True)
 
 
-def report_progress(parts: Iterable[tuple[Part, int]], standing: Tally, report: Callable[[Tally], None]) -> None:
+def report_progress(parts: Iterable[tuple[Part, int]], tally: Tally, report: Callable[[Tally], None]) -> None:
     """Report the progress after each part."""
-    report(standing)
+    report(tally)
     for part, failed in parts:
-        standing.done += part.count
-        standing.failed += failed
-        report(standing)
+        tally.done += part.count
+        tally.failed += failed
+        report(tally)
 
 
-def history(campaign: Campaign, trials: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def error_history(campaign: Campaign, trials: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the times (time,) [s] and the error's 2-norm (trials, time) [-] of these trials."""
     ready = campaign.ready
     rows = jax.tree.map(jnp.asarray, campaign.rows(trials))
-    about = ready.parts, ready.dispersion, jnp.uint32(campaign.seed), rows, campaign.software
-    t, error, has_length = map(np.asarray, _history(*about))
+    arguments = ready.parts, ready.dispersion, jnp.uint32(campaign.seed), rows, campaign.software
+    t, error, has_length = map(np.asarray, _history(*arguments))
     return t[0][has_length[0]], error[:, has_length[0]]
 
 
@@ -283,10 +287,12 @@ def history(campaign: Campaign, trials: np.ndarray) -> tuple[np.ndarray, np.ndar
 def _history(
     parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Array | Row, software: Software
 ) -> tuple:
-    def one(trial: jax.Array | Row) -> tuple:
-        about = table_rows.about(parts, dispersion, seed, trial)
-        log = rollout.simulate(about.drawn, about.seed, about.trial, record=True, software=software).log
+    def simulate_one(trial: jax.Array | Row) -> tuple:
+        trial_parts = table_rows.about(parts, dispersion, seed, trial)
+        log = rollout.simulate(
+            trial_parts.drawn, trial_parts.seed, trial_parts.trial, record=True, software=software
+        ).log
         assert log is not None
         return log.t, jnp.sqrt(jnp.sum(log.error**2, axis=-1)), log.has_length
 
-    return montecarlo.blocks(one, trials)
+    return montecarlo.map_in_blocks(simulate_one, trials)

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from ptsmc_jax.campaigns import store
-from ptsmc_jax.campaigns.campaign import Block, Campaign, failures
+from ptsmc_jax.campaigns.campaign import Block, Campaign, count_failures
 from ptsmc_jax.campaigns.rows import Part, Rows
 from ptsmc_jax.campaigns.store import RefusedError
 
-LOST = 5  # number of workers that may be lost with a part before the campaign fails
+ALLOWED_LOSSES = 5  # number of workers that may be lost with a part before the campaign fails
 _one_at_a_time = threading.Lock()  # because a part uses all devices of its process
 
 
@@ -40,17 +40,19 @@ class Cluster:
         """
         from distributed import as_completed
 
-        recipe, rows, here = folder.recipe(), folder.rows, store.packages()
+        recipe, rows, our_versions = folder.recipe(), folder.rows, store.packages()
         futures = [self._client.submit(_simulate_part, recipe, *part, pure=False, retries=0) for part in wanted]
         try:
             for future in as_completed(futures, loop=self._client.loop):
                 error = future.exception()
                 if error is not None:
-                    raise RefusedError(f"a worker of the cluster failed: {_sentence(error)}")
+                    raise RefusedError(f"a worker of the cluster failed: {_format_error(error)}")
                 first, count, name, failed, versions = future.result()
-                if versions != here:
-                    key = next(key for key in versions if versions[key] != here[key])
-                    raise RefusedError(f"a worker of the cluster has {key} {versions[key]}, but here is {here[key]}")
+                if versions != our_versions:
+                    key = next(key for key in versions if versions[key] != our_versions[key])
+                    raise RefusedError(
+                        f"a worker of the cluster has {key} {versions[key]}, but here is {our_versions[key]}"
+                    )
                 path = rows.folder / name
                 if not path.is_file():
                     raise RefusedError(f"a worker wrote {name}, which is not in {rows.folder} here: it must be shared")
@@ -65,7 +67,7 @@ class Cluster:
             self._local.close()
 
 
-def connected(address: str, tls: Mapping[str, str]) -> Cluster:
+def connect(address: str, tls: Mapping[str, str]) -> Cluster:
     """Connect to a cluster.
 
     Args:
@@ -84,7 +86,7 @@ def connected(address: str, tls: Mapping[str, str]) -> Cluster:
         from distributed import Client, LocalCluster, Security
     except ImportError:
         raise RefusedError("--cluster needs Dask, which is not installed: pip install 'ptsmc-jax[cluster]'") from None
-    config.set({"distributed.scheduler.allowed-failures": LOST})
+    config.set({"distributed.scheduler.allowed-failures": ALLOWED_LOSSES})
     security = Security(**tls, require_encryption=True) if tls else None
     local = None
     if address.startswith("local:"):
@@ -94,23 +96,23 @@ def connected(address: str, tls: Mapping[str, str]) -> Cluster:
         local = LocalCluster(
             n_workers=int(count), threads_per_worker=1, host="127.0.0.1", dashboard_address=":0", processes=True
         )
-    where: dict[str, Any] = {"address": address if local is None else local}
+    target: dict[str, Any] = {"address": address if local is None else local}
     if address.endswith(".json"):
         if not Path(address).is_file():
             raise RefusedError(f"--cluster is {address}, which does not exist")
-        where = {"scheduler_file": address}
+        target = {"scheduler_file": address}
     try:
-        return Cluster(Client(**where, security=security, timeout="10s", set_as_default=False), local)
+        return Cluster(Client(**target, security=security, timeout="10s", set_as_default=False), local)
     except (OSError, ValueError, TypeError) as error:
-        raise RefusedError(f"--cluster is {address}, which does not answer: {_sentence(error)}") from None
+        raise RefusedError(f"--cluster is {address}, which does not answer: {_format_error(error)}") from None
 
 
-def _sentence(error: BaseException) -> str:
+def _format_error(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
 @lru_cache(maxsize=4)
-def _campaign(make: Callable[..., tuple[Campaign, Rows]], arguments: tuple) -> tuple[Campaign, Rows]:
+def _make_campaign(make: Callable[..., tuple[Campaign, Rows]], arguments: tuple) -> tuple[Campaign, Rows]:
     from ptsmc_jax.configure import configure
 
     with contextlib.suppress(RuntimeError):  # the worker's process has used JAX already
@@ -121,7 +123,7 @@ def _campaign(make: Callable[..., tuple[Campaign, Rows]], arguments: tuple) -> t
 def _simulate_part(recipe: tuple[Callable, tuple], first: int, count: int) -> tuple:
     """On a worker: simulate and write a part. Return first trial, count, file name, failures and versions."""
     with _one_at_a_time:
-        campaign, rows = _campaign(*recipe)
+        campaign, rows = _make_campaign(*recipe)
         frame = campaign.simulate(range(first, first + count))
     part = rows.write(first, frame)
-    return first, count, part.path.name, failures(frame), store.packages()
+    return first, count, part.path.name, count_failures(frame), store.packages()

@@ -28,23 +28,23 @@ TRIALS = 256  # number of trials whose loops are judged if they differ
 LOOP_QUANTITIES = {INERTIA, CUSTOM, INITIAL_ATTITUDE, INITIAL_RATE, INITIAL_STATE, REFERENCE}
 LOOP_QUANTITIES |= {name for name, quantity in QUANTITIES.items() if quantity.hardware}
 LOOPS_PER_CALL = 32  # loops that are simulated and linearised at once
-JUDGED = 16  # loops whose exact margins are computed at a time
+EXACT_PER_CALL = 16  # loops whose exact margins are computed at a time
 DELAY = "delay_margin"  # the only margin that needs commands late within a period
-# first guess for the error of `margins.roughly`, in dB, deg, periods, dB; see `worst`
+# first guess for the error of `margins.estimate`, in dB, deg, periods, dB; see `worst_margins`
 ASSUMED_ERROR = {"gain_margin": 0.06, "phase_margin": 0.12, "delay_margin": 0.2, "peak_sensitivity": 0.01}
 # values that are not interpolated: of unstable loops, and of loops that no gain or phase makes unstable
-NOT_INTERPOLATED = (0.0, margins.MOST, -margins.MOST, 180.0, -180.0)
+NOT_INTERPOLATED = (0.0, margins.LARGEST_MARGIN, -margins.LARGEST_MARGIN, 180.0, -180.0)
 
 
-def of_loop(parts: Parts, asked: Sequence[Requirement]) -> list[Verdict]:
-    """Return the verdict on each required margin of the loop of these parts, see `run_margins.judged`.
+def judge_loop(parts: Parts, required: Sequence[Requirement]) -> list[Verdict]:
+    """Return the verdict on each required margin of the loop of these parts, see `run_margins.judge_run`.
 
     There are no margins if the nominal run does not come to rest, see `limit_cycles`.
     """
-    return _verdicts(asked, run_margins.judged(parts)[0].worst()) if asked else []
+    return _verdicts(required, run_margins.judge_run(parts)[0].worst()) if required else []
 
 
-def of_trials(ready: Study, seed: int, rows: np.ndarray | Row | None = None) -> list[Verdict]:
+def judge_trials(ready: Study, seed: int, rows: np.ndarray | Row | None = None) -> list[Verdict]:
     """Return the verdict on each required margin: of the nominal loop, or the worst of the first `TRIALS` trials.
 
     Args:
@@ -55,16 +55,16 @@ def of_trials(ready: Study, seed: int, rows: np.ndarray | Row | None = None) -> 
     Returns:
         The verdicts. The nominal run decides whether runs come to rest.
     """
-    trials = _whose_loops_differ(ready, rows)
+    trials = _select_trials(ready, rows)
     if trials is None or limit_cycles.find(ready.parts) is not None:
-        return of_loop(ready.parts, ready.margins)
+        return judge_loop(ready.parts, ready.margins)
     limits = {requirement.metric: requirement.limit for requirement in ready.margins}
-    return _verdicts(ready.margins, worst(ready.parts, ready.dispersion, seed, trials, limits))
+    return _verdicts(ready.margins, worst_margins(ready.parts, ready.dispersion, seed, trials, limits))
 
 
 def prepare(ready: Study, rows: np.ndarray | Row | None = None) -> None:
-    """Start to compile the programs of `of_trials` in the background."""
-    trials = _whose_loops_differ(ready, rows)
+    """Start to compile the programs of `judge_trials` in the background."""
+    trials = _select_trials(ready, rows)
     if trials is not None:
         late = any(requirement.metric == DELAY for requirement in ready.margins)
         _loops_and_margins.prepare(*_arguments(ready.parts, ready.dispersion, 0, trials, late))
@@ -72,21 +72,21 @@ def prepare(ready: Study, rows: np.ndarray | Row | None = None) -> None:
         run_margins.judged_margins_jit.prepare(ready.parts)
 
 
-def _whose_loops_differ(ready: Study, rows: np.ndarray | Row | None) -> np.ndarray | Row | None:
+def _select_trials(ready: Study, rows: np.ndarray | Row | None) -> np.ndarray | Row | None:
     """Return the trials whose margins are required; None: only the nominal loop, or no margin is required."""
-    given_loops = isinstance(rows, Row) and not LOOP_QUANTITIES.isdisjoint(rows.given)
-    if not ready.margins or not (given_loops or differ(ready.dispersion)):
+    table_sets_loops = isinstance(rows, Row) and not LOOP_QUANTITIES.isdisjoint(rows.given)
+    if not ready.margins or not (table_sets_loops or has_different_loops(ready.dispersion)):
         return None
     return np.arange(TRIALS) if rows is None else rows
 
 
-def _verdicts(asked: Sequence[Requirement], by_name: Mapping[str, ArrayLike]) -> list[Verdict]:
+def _verdicts(required: Sequence[Requirement], by_name: Mapping[str, ArrayLike]) -> list[Verdict]:
     """Return the verdict on each required margin, from the values of one or many loops by name."""
-    values = [np.asarray(by_name[requirement.metric]) for requirement in asked]
-    return [r.verdict(value, np.asarray(~np.isnan(value))) for r, value in zip(asked, values, strict=True)]
+    values = [np.asarray(by_name[requirement.metric]) for requirement in required]
+    return [r.verdict(value, np.asarray(~np.isnan(value))) for r, value in zip(required, values, strict=True)]
 
 
-def differ(dispersion: Dispersion) -> bool:
+def has_different_loops(dispersion: Dispersion) -> bool:
     """Return whether the loops differ from trial to trial."""
     return not LOOP_QUANTITIES.isdisjoint(dispersion.kinds)
 
@@ -96,7 +96,7 @@ def signed_violation_ratio(value: Any, limit: Any, name: str) -> Any:
     return 2.0 - value / limit if MARGINS[name].at_least else value / limit
 
 
-def worst(
+def worst_margins(
     parts: Parts,
     dispersion: Dispersion,
     seed: int,
@@ -109,7 +109,7 @@ def worst(
     The worst value of each margin is exact, and so are the margins of the `places` trials nearest to a limit. The other
     margins are interpolated: they are farther from their limits, and on the right side, as far as the error is known.
 
-    First, the margins of every loop are interpolated between the frequencies of the exact search (`margins.roughly`).
+    First, the margins of every loop are interpolated between the frequencies of the exact search (`margins.estimate`).
     Then exact margins are computed, nearest to a limit first, until an error of `ASSUMED_ERROR` in the other loops can
     neither change the worst loop nor move a loop across a limit. Each exact margin shows the error of the
     interpolation. If it exceeds half of `ASSUMED_ERROR`, the assumed error becomes twice the observed error. Exact
@@ -128,51 +128,51 @@ def worst(
     """
     names, count = tuple(limits), jax.tree.leaves(trials)[0].shape[0]
     late = DELAY in names
-    looks = _loops_and_margins(*_arguments(parts, dispersion, seed, trials, late))
-    loops, rough = jax.tree.map(lambda v: np.asarray(v)[:count].reshape(-1, *v.shape[2:]), looks)
+    padded_results = _loops_and_margins(*_arguments(parts, dispersion, seed, trials, late))
+    loops, rough = jax.tree.map(lambda v: np.asarray(v)[:count].reshape(-1, *v.shape[2:]), padded_results)
     values = np.stack([rough[name] for name in names])  # (margins, loops)
     limit = np.asarray([limits[name] for name in names])[:, None]
-    off = np.asarray([[ASSUMED_ERROR[name] * (loops.period[0] if name == DELAY else 1.0)] for name in names]) / limit
-    unsure = np.isfinite(values) & ~np.isin(values, NOT_INTERPOLATED)
+    error = np.asarray([[ASSUMED_ERROR[name] * (loops.period[0] if name == DELAY else 1.0)] for name in names]) / limit
+    is_interpolated = np.isfinite(values) & ~np.isin(values, NOT_INTERPOLATED)
     while True:
-        near = _violation_ratios(values, limit, names)
-        low, high = near - np.where(unsure, off, 0.0), near + np.where(unsure, off, 0.0)
+        ratios = _violation_ratios(values, limit, names)
+        low, high = ratios - np.where(is_interpolated, error, 0.0), ratios + np.where(is_interpolated, error, 0.0)
         by_trial = np.sort(low.reshape(len(names), count, -1).max(axis=(0, 2)))
-        least = np.minimum(low.max(axis=1, keepdims=True), by_trial[-min(places, count)])
-        unsettled = unsure & ((high >= least) | ((low <= 1.0) & (high >= 1.0)))
-        order = np.argsort(-np.where(unsettled, high, -np.inf).max(axis=0), kind="stable")
-        chosen = order[: min(JUDGED, np.count_nonzero(unsettled.any(axis=0)))]
+        threshold = np.minimum(low.max(axis=1, keepdims=True), by_trial[-min(places, count)])
+        is_undecided = is_interpolated & ((high >= threshold) | ((low <= 1.0) & (high >= 1.0)))
+        order = np.argsort(-np.where(is_undecided, high, -np.inf).max(axis=0), kind="stable")
+        chosen = order[: min(EXACT_PER_CALL, np.count_nonzero(is_undecided.any(axis=0)))]
         if not chosen.size:
-            return {name: _worst_of(name, v.reshape(count, -1)) for name, v in zip(names, values, strict=True)}
-        chosen = np.resize(chosen, JUDGED)  # always the same shape, so that one program is compiled
-        some = jax.tree.map(lambda v, chosen=chosen: v[chosen], loops)
-        full = margins.compute_each(some, with_delay=late).each()
-        exact = np.stack([_worst_of(name, np.asarray(full[name])) for name in names])
-        apart = np.abs(_violation_ratios(exact, limit, names) - near[:, chosen])
-        apart = np.where(np.isfinite(apart), apart, 0.0).max(axis=1, keepdims=True)
-        off = np.where(apart > off / 2.0, 2.0 * apart, off)
-        values[:, chosen], unsure[:, chosen] = exact, False
+            return {name: _worst_value(name, v.reshape(count, -1)) for name, v in zip(names, values, strict=True)}
+        chosen = np.resize(chosen, EXACT_PER_CALL)  # always the same shape, so that one program is compiled
+        chosen_loops = jax.tree.map(lambda v, chosen=chosen: v[chosen], loops)
+        exact_by_name = margins.compute_each(chosen_loops, with_delay=late).by_name()
+        exact = np.stack([_worst_value(name, np.asarray(exact_by_name[name])) for name in names])
+        deviation = np.abs(_violation_ratios(exact, limit, names) - ratios[:, chosen])
+        deviation = np.where(np.isfinite(deviation), deviation, 0.0).max(axis=1, keepdims=True)
+        error = np.where(deviation > error / 2.0, 2.0 * deviation, error)
+        values[:, chosen], is_interpolated[:, chosen] = exact, False
 
 
 def _arguments(parts: Parts, dispersion: Dispersion, seed: int, trials: np.ndarray | Row, late: bool) -> tuple:
     """Return the arguments of `_loops_and_margins`; trials are repeated to fill the last call on every device."""
     devices = len(configure.processors())
-    together = LOOPS_PER_CALL * devices
+    trials_per_round = LOOPS_PER_CALL * devices
 
-    def padded(v: np.ndarray) -> Array:
-        return jnp.asarray(np.resize(v, (-(-v.shape[0] // together) * together, *v.shape[1:])))
+    def pad(v: np.ndarray) -> Array:
+        return jnp.asarray(np.resize(v, (-(-v.shape[0] // trials_per_round) * trials_per_round, *v.shape[1:])))
 
-    some = jax.tree.map(padded, trials if isinstance(trials, Row) else np.asarray(trials, dtype=np.uint32))
-    return parts, dispersion, jnp.uint32(seed), some, devices, late
+    padded_trials = jax.tree.map(pad, trials if isinstance(trials, Row) else np.asarray(trials, dtype=np.uint32))
+    return parts, dispersion, jnp.uint32(seed), padded_trials, devices, late
 
 
 def _violation_ratios(values: np.ndarray, limit: np.ndarray, names: Sequence[str]) -> np.ndarray:
     """Return the `signed_violation_ratio` of each margin, (margins, loops); a loop without a value comes last."""
-    near = np.stack([signed_violation_ratio(v, one, name) for v, one, name in zip(values, limit, names, strict=True)])
-    return np.where(np.isnan(near), -np.inf, near)
+    ratios = np.stack([signed_violation_ratio(v, one, name) for v, one, name in zip(values, limit, names, strict=True)])
+    return np.where(np.isnan(ratios), -np.inf, ratios)
 
 
-def _worst_of(name: str, values: Any) -> Any:
+def _worst_value(name: str, values: Any) -> Any:
     """Return the worst value along the last axis."""
     return values.min(axis=-1) if MARGINS[name].at_least else values.max(axis=-1)
 
@@ -183,26 +183,26 @@ def _loops_and_margins(
 ) -> tuple[linear.Loop, dict[str, Array]]:
     """Return the loops of each trial, (trials, times, ..), and their interpolated margins, the worst over the axes.
 
-    late: see `linear.opened`.
+    late: `fractional_delays` of `linear.linearise_period`.
     """
 
-    def rough(loop: linear.Loop) -> dict[str, Array]:
-        return {name: _worst_of(name, v) for name, v in margins.roughly(loop).items()}
+    def interpolate_margins(loop: linear.Loop) -> dict[str, Array]:
+        return {name: _worst_value(name, v) for name, v in margins.estimate(loop).items()}
 
-    def simulated(trial: Array | Row) -> tuple[Parts, linear.Nominal]:
+    def simulate_trial(trial: Array | Row) -> tuple[Parts, linear.NominalRun]:
         drawn = table_rows.about(parts, dispersion, seed, trial).drawn
-        return drawn, linear.nominal(drawn)
+        return drawn, linear.simulate_nominal(drawn)
 
-    def loops_of_trial(drawn: Parts, run: linear.Nominal) -> linear.Loop:
-        return run_margins.judged_loops(drawn, run, late=late)[0]
+    def loops_of_trial(drawn: Parts, run: linear.NominalRun) -> linear.Loop:
+        return run_margins.judged_loops(drawn, run, fractional_delays=late)[0]
 
-    def some(trials: Array | Row) -> tuple[linear.Loop, dict[str, Array]]:
-        loops = lapack.vmap(loops_of_trial)(*lanes.vmap(simulated)(trials))
-        values = jax.lax.map(rough, jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), loops))
+    def analyse_trials(trials: Array | Row) -> tuple[linear.Loop, dict[str, Array]]:
+        loops = lapack.vmap(loops_of_trial)(*lanes.vmap(simulate_trial)(trials))
+        values = jax.lax.map(interpolate_margins, jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), loops))
         return loops, {name: v.reshape(LOOPS_PER_CALL, -1) for name, v in values.items()}
 
-    def on_device(trials: Array | Row) -> tuple[linear.Loop, dict[str, Array]]:
-        calls = jax.lax.map(some, jax.tree.map(lambda v: v.reshape(-1, LOOPS_PER_CALL, *v.shape[1:]), trials))
+    def analyse_on_device(trials: Array | Row) -> tuple[linear.Loop, dict[str, Array]]:
+        calls = jax.lax.map(analyse_trials, jax.tree.map(lambda v: v.reshape(-1, LOOPS_PER_CALL, *v.shape[1:]), trials))
         return jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), calls)
 
-    return montecarlo.over_devices(on_device, trials, devices)
+    return montecarlo.map_over_devices(analyse_on_device, trials, devices)

@@ -22,7 +22,7 @@ from ptsmc_jax.numerics.draws import WholeNumber, check_whole_number
 from ptsmc_jax.numerics.pytrees import listing
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.assembly import Parts, check_parts
-from ptsmc_jax.simulation.computer import OURS, Software
+from ptsmc_jax.simulation.computer import PYTHON_SOFTWARE, Software
 from ptsmc_jax.simulation.metrics import Metrics
 
 FEW = 64  # smaller numbers of trials use a program for this many, because a step of one trial costs nearly as much
@@ -93,7 +93,7 @@ def one(
     trial: WholeNumber | Row,
     coordinates: Coordinates | None = None,
     custom_metrics: CustomMetrics | None = None,
-    software: Software = OURS,
+    software: Software = PYTHON_SOFTWARE,
 ) -> Simulated:
     """Simulate one trial: a pure function, for any transformation.
 
@@ -114,14 +114,16 @@ def one(
     """
     check_parts(parts)
     check_dispersion(dispersion)
-    about = table_rows.about(parts, dispersion, seed, trial)
+    trial_parts = table_rows.about(parts, dispersion, seed, trial)
     if coordinates is None:
-        coordinates = about.dispersion.coordinates(about.seed, about.trial)
-    drawn = about.dispersion.at(about.parts, coordinates)
-    result = rollout.simulate(drawn, about.seed, about.trial, record=custom_metrics is not None, software=software)
-    found = {} if custom_metrics is None else custom_metrics(result, drawn)
-    dispersed_values = _values(dispersion, drawn, about, coordinates)
-    return Simulated(result.metrics, result.status, result.bad_time, dispersed_values, found, result.samples)
+        coordinates = trial_parts.dispersion.coordinates(trial_parts.seed, trial_parts.trial)
+    drawn = trial_parts.dispersion.at(trial_parts.parts, coordinates)
+    result = rollout.simulate(
+        drawn, trial_parts.seed, trial_parts.trial, record=custom_metrics is not None, software=software
+    )
+    custom_values = {} if custom_metrics is None else custom_metrics(result, drawn)
+    dispersed_values = _read_dispersed_values(dispersion, drawn, trial_parts, coordinates)
+    return Simulated(result.metrics, result.status, result.bad_time, dispersed_values, custom_values, result.samples)
 
 
 @programs.jit
@@ -132,19 +134,21 @@ def coordinates(dispersion: Dispersion, seed: jax.Array, trials: jax.Array) -> C
 
 def values(parts: Parts, dispersion: Dispersion, seed: WholeNumber, trial: WholeNumber | Row) -> dict[str, jax.Array]:
     """Return the dispersed quantities of a trial by name, without simulating it; arguments as for `one`."""
-    about = table_rows.about(parts, dispersion, seed, trial)
-    coordinates = about.dispersion.coordinates(about.seed, about.trial)
-    return _values(dispersion, about.dispersion.at(about.parts, coordinates), about, coordinates)
+    trial_parts = table_rows.about(parts, dispersion, seed, trial)
+    coordinates = trial_parts.dispersion.coordinates(trial_parts.seed, trial_parts.trial)
+    return _read_dispersed_values(
+        dispersion, trial_parts.dispersion.at(trial_parts.parts, coordinates), trial_parts, coordinates
+    )
 
 
-def _values(
-    dispersion: Dispersion, drawn: Parts, about: table_rows.About, coordinates: Coordinates
+def _read_dispersed_values(
+    dispersion: Dispersion, drawn: Parts, trial_parts: table_rows.About, coordinates: Coordinates
 ) -> dict[str, jax.Array]:
     """Read the quantities from the parts of a trial; add the gyro's bias and numbers of custom dispersions."""
-    by_column = dispersion.values(drawn, set(about.given) - {RATE_BIAS})
+    by_column = dispersion.values(drawn, set(trial_parts.given) - {RATE_BIAS})
     if dispersion.custom is not None:
         by_column |= dispersion.custom.values(coordinates[CUSTOM])
-    return by_column | drawn.sensors.drawn(about.seed, about.trial)
+    return by_column | drawn.sensors.trial_constants(trial_parts.seed, trial_parts.trial)
 
 
 def run(
@@ -155,7 +159,7 @@ def run(
     block: int | None = None,
     custom_metrics: CustomMetrics | None = None,
     kernel: bool | None = None,
-    software: Software = OURS,
+    software: Software = PYTHON_SOFTWARE,
 ) -> Trials:
     """Simulate these trials, or rows of a run table. Results do not depend on blocks, devices and order.
 
@@ -189,39 +193,39 @@ def run(
     check_whole_number("seed", seed)
     check_dispersion(dispersion)
     check_whole_number("block", 1 if block is None else block, 1)
-    trials = trials if isinstance(trials, Row) else _numbers(trials)
-    number = np.asarray(trials.trial if isinstance(trials, Row) else trials)
-    count = number.shape[0]
-    devices, rows, block = _slots(count, block)
+    trials = trials if isinstance(trials, Row) else _check_trial_numbers(trials)
+    trial_numbers = np.asarray(trials.trial if isinstance(trials, Row) else trials)
+    count = trial_numbers.shape[0]
+    devices, rows, block = _program_shape(count, block)
     size = devices * rows * block
-    kernel = by_kernel() if kernel is None else kernel
+    kernel = uses_kernel() if kernel is None else kernel
     calls = []
     for k in range(0, count, size):
-        places, per_device = scattered(min(size, count - k), devices, rows * block)
-        chosen = k + places.reshape(devices, rows, block)
-        numbers = jax.tree.map(lambda v, chosen=chosen: jnp.asarray(v[chosen]), trials)
-        needed = jnp.int32(-(-per_device // block))
+        items, per_device = scatter(min(size, count - k), devices, rows * block)
+        item_indices = k + items.reshape(devices, rows, block)
+        numbers = jax.tree.map(lambda v, item_indices=item_indices: jnp.asarray(v[item_indices]), trials)
+        used_rows = jnp.int32(-(-per_device // block))
         results = _simulate_rows(
-            parts, dispersion, jnp.uint32(seed), numbers, needed, devices, custom_metrics, kernel, software
+            parts, dispersion, jnp.uint32(seed), numbers, used_rows, devices, custom_metrics, kernel, software
         )
         flat = jax.tree.map(lambda v: np.asarray(v).reshape(devices, rows * block, *v.shape[3:]), results)
-        calls.append(jax.tree.map(lambda v, k=k, per_device=per_device: gathered(v, per_device)[: count - k], flat))
-    return Trials(number, *jax.tree.map(lambda *many: np.concatenate(many), *calls))
+        calls.append(jax.tree.map(lambda v, k=k, per_device=per_device: gather(v, per_device)[: count - k], flat))
+    return Trials(trial_numbers, *jax.tree.map(lambda *many: np.concatenate(many), *calls))
 
 
-def _numbers(trials: ArrayLike) -> np.ndarray:
+def _check_trial_numbers(trials: ArrayLike) -> np.ndarray:
     """Return checked numbers of trials. A cast alone would accept fractions and negative numbers."""
     numbers = np.asarray(trials)
     if numbers.ndim != 1 or not numbers.size:
         raise ValueError(f"trials is of shape {numbers.shape}, but must be the numbers of one trial or more, (N,)")
-    whole = np.issubdtype(numbers.dtype, np.integer)
-    if not whole or numbers.min() < 0 or numbers.max() >= 2**32:
-        said = f"between {numbers.min()} and {numbers.max()}" if whole else f"of type {numbers.dtype}"
-        raise ValueError(f"trials are {said}, but must be whole numbers from 0 to {2**32 - 1}")
+    is_whole = np.issubdtype(numbers.dtype, np.integer)
+    if not is_whole or numbers.min() < 0 or numbers.max() >= 2**32:
+        description = f"between {numbers.min()} and {numbers.max()}" if is_whole else f"of type {numbers.dtype}"
+        raise ValueError(f"trials are {description}, but must be whole numbers from 0 to {2**32 - 1}")
     return numbers.astype(np.uint32)
 
 
-def scattered(count: int, devices: int, slots: int) -> tuple[np.ndarray, int]:
+def scatter(count: int, devices: int, slots: int) -> tuple[np.ndarray, int]:
     """Distribute items over devices.
 
     Args:
@@ -233,18 +237,18 @@ def scattered(count: int, devices: int, slots: int) -> tuple[np.ndarray, int]:
         The item in each slot, (devices, slots), and the number of used slots of a device. Other slots repeat items.
     """
     per_device = -(-count // devices)
-    places = np.zeros((devices, slots), int)
-    places[:, :per_device] = np.resize(np.arange(count), (devices, per_device))
-    return places, per_device
+    items = np.zeros((devices, slots), int)
+    items[:, :per_device] = np.resize(np.arange(count), (devices, per_device))
+    return items, per_device
 
 
-def gathered(results: np.ndarray, per_device: int) -> np.ndarray:
-    """Return the results of `scattered` items in their order, (devices, slots, ..) -> (devices * per_device, ..)."""
-    counted = np.asarray(results)[:, :per_device]
-    return counted.reshape(-1, *counted.shape[2:])
+def gather(results: np.ndarray, per_device: int) -> np.ndarray:
+    """Return the results in the order of the items of `scatter`, (devices, slots, ..) -> (devices * per_device, ..)."""
+    used = np.asarray(results)[:, :per_device]
+    return used.reshape(-1, *used.shape[2:])
 
 
-def _slots(count: int, block: int | None = None) -> tuple[int, int, int]:
+def _program_shape(count: int, block: int | None = None) -> tuple[int, int, int]:
     """Return the shape (devices, rows, block) of the program that simulates `count` trials, see `_simulate_rows`."""
     devices = len(configure.devices())
     if count < FEW:
@@ -255,9 +259,11 @@ def _slots(count: int, block: int | None = None) -> tuple[int, int, int]:
 
 def prepare(parts: Parts, dispersion: Dispersion, count: int) -> None:
     """Start to compile the program for `count` trials of such parts in the background."""
-    slots = _slots(count)
-    numbers = np.zeros(slots, dtype=np.uint32)
-    _simulate_rows.prepare(parts, dispersion, jnp.uint32(0), numbers, jnp.int32(0), slots[0], None, by_kernel(), OURS)
+    shape = _program_shape(count)
+    numbers = np.zeros(shape, dtype=np.uint32)
+    _simulate_rows.prepare(
+        parts, dispersion, jnp.uint32(0), numbers, jnp.int32(0), shape[0], None, uses_kernel(), PYTHON_SOFTWARE
+    )
 
 
 @programs.jit(
@@ -283,16 +289,16 @@ def _simulate_rows(
 
     result = jax.eval_shape(simulate_one, jax.tree.map(lambda v: v[0, 0, 0], trials))
     width = jax.tree.leaves(trials)[0].shape[2]
-    return row_by_row(lanes.vmap(simulate_one, kernel=kernel), result, width, trials, needed, devices)
+    return evaluate_rows(lanes.vmap(simulate_one, kernel=kernel), result, width, trials, needed, devices)
 
 
-def row_by_row(
-    simulated: Callable, result: PyTree, width: int, rows: PyTree, needed: jax.Array, devices: int
+def evaluate_rows(
+    simulate_row: Callable, result: PyTree, width: int, rows: PyTree, needed: jax.Array, devices: int
 ) -> PyTree:
     """Evaluate one row after the other on each device.
 
     Args:
-        simulated: the function of a row of trials.
+        simulate_row: the function of a row of trials.
         result: shapes and types of the result of one trial; tracing a whole row for them takes long.
         width: trials in a row.
         rows: arrays (devices, rows, ..).
@@ -303,18 +309,18 @@ def row_by_row(
         The results, (devices, rows, width, ..); rows from `needed` on are zero.
     """
 
-    def on_device(rows: PyTree) -> PyTree:
-        here = jax.tree.map(lambda v: v[0], rows)
-        count = jax.tree.leaves(here)[0].shape[0]
+    def evaluate_on_device(rows: PyTree) -> PyTree:
+        device_rows = jax.tree.map(lambda v: v[0], rows)
+        count = jax.tree.leaves(device_rows)[0].shape[0]
         empty = jax.tree.map(lambda v: jnp.zeros((count, width, *v.shape), v.dtype), result)
 
-        def step(k: jax.Array, done: PyTree) -> PyTree:
-            row = simulated(jax.tree.map(lambda v: v[k], here))
-            return jax.tree.map(lambda into, v: into.at[k].set(v), done, row)
+        def step(k: jax.Array, results: PyTree) -> PyTree:
+            row = simulate_row(jax.tree.map(lambda v: v[k], device_rows))
+            return jax.tree.map(lambda array, v: array.at[k].set(v), results, row)
 
         return jax.tree.map(lambda v: v[None], jax.lax.fori_loop(0, needed, step, empty))
 
-    return over_devices(on_device, rows, devices)
+    return map_over_devices(evaluate_on_device, rows, devices)
 
 
 def block_size() -> int:
@@ -322,12 +328,12 @@ def block_size() -> int:
     return BLOCK if configure.backend() == "cpu" else BLOCK_ON_GPU
 
 
-def by_kernel() -> bool:
+def uses_kernel() -> bool:
     """Return whether the loop over time is one kernel: on a GPU, where each step would cost launches."""
     return configure.backend() == "gpu"
 
 
-def blocks(function: Callable, trials: PyTree) -> PyTree:
+def map_in_blocks(function: Callable, trials: PyTree) -> PyTree:
     """Return `lanes.vmap(function)(trials)`, evaluated in blocks of equal size of at most `block_size()` trials.
 
     trials: arguments of `function`, with a leading axis over trials.
@@ -345,7 +351,7 @@ def blocks(function: Callable, trials: PyTree) -> PyTree:
     return jax.tree.map(lambda v: v.reshape(rows * size, *v.shape[2:])[:count], results)
 
 
-def over_devices(function: Callable, shared: PyTree, devices: int) -> PyTree:
+def map_over_devices(function: Callable, shared: PyTree, devices: int) -> PyTree:
     """Return function(shared), with the first axes of argument and results distributed over the devices."""
     if devices == 1:
         return function(shared)

@@ -20,11 +20,11 @@ import polars as pl
 from ptsmc_jax.campaigns import store
 
 FOLDER = "trials"
-RECENT = 1_000_000_000  # [ns] a file that changed so recently may change again with the same time of change
+RECENT_CHANGE = 1_000_000_000  # [ns] a file that changed so recently may change again with the same time of change
 _NAME = re.compile(r"(\d{10})-(\d{10})-([0-9a-f]{32})\.parquet")
 
 
-def named(path: Path) -> bool:
+def has_part_name(path: Path) -> bool:
     """Return whether a file has the name of a part, of any campaign."""
     return _NAME.fullmatch(path.name) is not None
 
@@ -48,17 +48,17 @@ class Rows:
     """The parts in a folder that belong to one campaign."""
 
     folder: Path
-    key: bytes  # see `key_of`
+    key: bytes  # see `campaign_key`
 
     def write(self, first: int, frame: pl.DataFrame) -> Part:
         """Write a part: first a temporary file, which is renamed when it is on disk."""
-        return self.put(first, frame.height, encoded(frame))
+        return self.put(first, frame.height, encode_parquet(frame))
 
     def put(self, first: int, count: int, content: bytes) -> Part:
         """Write a part with this content. Raises OSError if the disk is full."""
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self.folder / f"{first:010d}-{first + count - 1:010d}-{self._checksum(first, count, content)}.parquet"
-        with store.replacing(path) as making, making.open("xb") as file:
+        with store.replace_file(path) as temporary, temporary.open("xb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
@@ -66,35 +66,35 @@ class Rows:
 
     def parts(self) -> tuple[list[Part], list[Path]]:
         """Return the parts in order, without overlaps, and files that are damaged or of another campaign."""
-        whole, broken = [], []
+        complete, damaged = [], []
         for path in sorted(self.folder.glob("*.parquet")):
             name = _NAME.fullmatch(path.name)
             first, count = (int(name[1]), int(name[2]) - int(name[1]) + 1) if name else (0, 0)
             if name is not None and self._checksum_of(path, first, count) == name[3]:
-                whole.append(Part(first, count, path))
+                complete.append(Part(first, count, path))
             else:
-                broken.append(path)
+                damaged.append(path)
         parts: list[Part] = []
-        for part in sorted(whole, key=lambda p: (p.first, -p.count)):
+        for part in sorted(complete, key=lambda p: (p.first, -p.count)):
             if not parts or part.first >= parts[-1].end:
                 parts.append(part)
-        return parts, broken
+        return parts, damaged
 
     def tidy(self, parts: Iterable[Part]) -> None:
         """Remove temporary files of killed processes, and all parts except these."""
-        for path in self.folder.glob(f"{store.MAKING}*"):
+        for path in self.folder.glob(f"{store.TEMPORARY_PREFIX}*"):
             path.unlink(missing_ok=True)
-        whole = {part.path for part in parts}
+        kept = {part.path for part in parts}
         for path in self.folder.glob("*.parquet"):
-            if path not in whole and named(path):
+            if path not in kept and has_part_name(path):
                 path.unlink(missing_ok=True)
 
     def _checksum_of(self, path: Path, first: int, count: int) -> str:
         """Return the checksum of a file's content; an unchanged file is not read again."""
-        about = path.stat()
-        if time.time_ns() - about.st_mtime_ns < RECENT:
+        status = path.stat()
+        if time.time_ns() - status.st_mtime_ns < RECENT_CHANGE:
             return self._checksum(first, count, path.read_bytes())
-        return _checksum_of_version(self, path, (about.st_ino, about.st_size, about.st_mtime_ns), first, count)
+        return _checksum_of_version(self, path, (status.st_ino, status.st_size, status.st_mtime_ns), first, count)
 
     def _checksum(self, first: int, count: int, content: bytes) -> str:
         checksum = hashlib.blake2b(content, digest_size=16, key=self.key)
@@ -108,13 +108,13 @@ def _checksum_of_version(rows: Rows, path: Path, version: tuple[int, int, int], 
     return rows._checksum(first, count, path.read_bytes())
 
 
-def key_of(scenario: store.Tables, made_by: store.Tables) -> bytes:
+def campaign_key(scenario: store.Tables, made_by: store.Tables) -> bytes:
     """Return the key of a campaign's checksums, from its scenario, seed and other inputs of its rows."""
     text = json.dumps([scenario, made_by], sort_keys=True, default=lambda value: f"<{type(value).__name__}>")
     return hashlib.sha256(text.encode()).digest()
 
 
-def encoded(frame: pl.DataFrame) -> bytes:
+def encode_parquet(frame: pl.DataFrame) -> bytes:
     """Return a table as the content of a Parquet file."""
     buffer = io.BytesIO()
     frame.write_parquet(buffer, compression="zstd", compression_level=1)
@@ -128,7 +128,7 @@ def read(parts: Sequence[Part], columns: Iterable[str] | None = None) -> pl.Data
     return pl.read_parquet([part.path for part in parts], columns=wanted, glob=False).rechunk()
 
 
-def columns_of(part: Part) -> list[str]:
+def column_names(part: Part) -> list[str]:
     """Return the names of the columns of a part, in order."""
     with part.path.open("rb") as file:  # opened here, because Polars takes a path as a pattern
         return list(pl.read_parquet_schema(file))

@@ -25,16 +25,16 @@ from ptsmc_jax.simulation.rollout import Parts
 
 ALLOWED = "a .csv or .parquet file with a row for each trial, or a folder of such .parquet files"
 ANGLE = "initial_angle"  # a column that follows from other columns
-HEADING = ("status", "reason", "bad_time")  # first columns of a result
-RESULTS = {*HEADING, *CATALOGUE}
-COUNTED = "controller_"  # beginning of the columns with numbers of samples by the status that exported C returned
-SAMPLES = tuple(f"{COUNTED}{ended}" for ended in computer.SAMPLES)
-MOST = 2**32  # largest number of trials, and of seeds
+STATUS_COLUMNS = ("status", "reason", "bad_time")  # first columns of a result
+RESULTS = {*STATUS_COLUMNS, *CATALOGUE}
+COUNT_PREFIX = "controller_"  # beginning of the columns with numbers of samples by the status that exported C returned
+SAMPLES = tuple(f"{COUNT_PREFIX}{ended}" for ended in computer.SAMPLE_STATUSES)
+MOST_TRIALS = 2**32  # largest number of trials, and of seeds
 
 
 @dataclass(frozen=True)
 class RunTable:
-    """A checked run table, see `checked`."""
+    """A checked run table, see `check_table`."""
 
     given: dict[str, np.ndarray]  # numbers (rows, n) by the names of `QUANTITIES`
     trial: np.ndarray | None  # (rows,) trial numbers that the table states
@@ -104,7 +104,7 @@ def read(path: Path) -> pl.DataFrame:
         raise RefusedError(f"--runs is {path}, which cannot be read: {first_line}") from None
 
 
-def checked(
+def check_table(
     table: pl.DataFrame,
     parts: Parts,
     where: str = "the run table",
@@ -127,9 +127,9 @@ def checked(
         RefusedError: a column is unknown or lacks the others of its vector, a cell is empty or not a finite number, or
             a value cannot be simulated. The sentence names column and row, counted from 0.
     """
-    if not 1 <= table.height <= MOST:
+    if not 1 <= table.height <= MOST_TRIALS:
         count = "no rows" if not table.height else f"{table.height} rows"
-        limit = "must have one for each trial" if not table.height else f"at most {MOST} are allowed"
+        limit = "must have one for each trial" if not table.height else f"at most {MOST_TRIALS} are allowed"
         raise RefusedError(f"{where} has {count}, but {limit}")
     columns_of = {name: quantity.columns(parts) for name, quantity in QUANTITIES.items()}
     quantity_of = {column: name for name, columns in columns_of.items() for column in columns}
@@ -144,16 +144,20 @@ def checked(
             *custom_metrics,
             *drawn,
         ):
-            close = parsing.nearest(column, (*quantity_of, *OF_ROWS))
-            raise RefusedError(f"{where} has the column {column}, which no trial of this scenario has; {close}")
+            suggestion = parsing.nearest_name_hint(column, (*quantity_of, *OF_ROWS))
+            raise RefusedError(f"{where} has the column {column}, which no trial of this scenario has; {suggestion}")
     given: dict[str, np.ndarray] = {}
     for column in table.columns:
         columns = columns_of.get(quantity_of.get(column, ""), [])
-        absent = next((one for one in columns if one not in table.columns), None)
-        if absent is not None:
-            raise RefusedError(f"{where} has the column {column}, but not {absent}: {_all(columns)} come together")
+        missing_column = next((column_name for column_name in columns if column_name not in table.columns), None)
+        if missing_column is not None:
+            raise RefusedError(
+                f"{where} has the column {column}, but not {missing_column}: {_column_range(columns)} come together"
+            )
         if columns and quantity_of[column] not in given:
-            given[quantity_of[column]] = np.stack([_numbers(table, one, where) for one in columns], axis=1)
+            given[quantity_of[column]] = np.stack(
+                [_finite_numbers(table, column_name, where) for column_name in columns], axis=1
+            )
     name = ""
     try:
         for name, values in given.items():
@@ -162,24 +166,24 @@ def checked(
             QUANTITIES[name].check_with(given, parts)
     except UnfitError as error:
         row, columns = ", ".join(f"{v:.9g}" for v in given[name][error.row]), columns_of[name]
-        heading = columns[0] if len(columns) == 1 else f"{_all(columns)} ="
-        raise _refusal(where, heading, error.row, row, str(error)) from None
-    whose = {}
+        heading = columns[0] if len(columns) == 1 else f"{_column_range(columns)} ="
+        raise _row_error(where, heading, error.row, row, str(error)) from None
+    stated_numbers = {}
     for name, other in OF_ROWS.items():  # rows of a campaign name the trial in the other column
         column = other if other in table.columns else name
-        whose[name] = _whole_numbers(table, column, where) if column in table.columns else None
-    if whose[TRIAL] is not None and np.array_equal(whose[TRIAL], np.arange(table.height)):
-        whose[TRIAL] = None  # the rows' own numbers are the default
-    angle = _numbers(table, ANGLE, where) if ANGLE in table.columns else None
-    stated = {name: _cells(table[name]) for name in drawn if name in table.columns}
-    return RunTable(given, whose[TRIAL], whose[SEED], angle, table.height, stated)
+        stated_numbers[name] = _whole_numbers(table, column, where) if column in table.columns else None
+    if stated_numbers[TRIAL] is not None and np.array_equal(stated_numbers[TRIAL], np.arange(table.height)):
+        stated_numbers[TRIAL] = None  # the rows' own numbers are the default
+    angle = _finite_numbers(table, ANGLE, where) if ANGLE in table.columns else None
+    custom_numbers = {name: _to_numbers(table[name]) for name in drawn if name in table.columns}
+    return RunTable(given, stated_numbers[TRIAL], stated_numbers[SEED], angle, table.height, custom_numbers)
 
 
 def check_angle(stated: np.ndarray, simulated: np.ndarray, where: str) -> None:
     """Raise RefusedError if the table's initial angles (rows,) do not follow from its other columns."""
-    off = np.abs(simulated - stated) > 1e-5 * np.maximum(1.0, np.abs(stated))
-    why = "follows from the rest, or no such column"
-    _refuse(off, where, ANGLE, stated, lambda row: f"{simulated[row]:.9g} there, which {why}")
+    is_wrong = np.abs(simulated - stated) > 1e-5 * np.maximum(1.0, np.abs(stated))
+    rule = "follows from the rest, or no such column"
+    _check_rows(is_wrong, where, ANGLE, stated, lambda row: f"{simulated[row]:.9g} there, which {rule}")
 
 
 def check_custom_numbers(stated: dict[str, np.ndarray], rows: pl.DataFrame, where: str) -> None:
@@ -187,41 +191,43 @@ def check_custom_numbers(stated: dict[str, np.ndarray], rows: pl.DataFrame, wher
 
     A table cannot set them, since only `Draw.at` knows the parts that follow from them.
     """
-    why = "is the number of its trial and seed, or no such column: a run table cannot set custom dispersions"
+    rule = "is the number of its trial and seed, or no such column: a run table cannot set custom dispersions"
     for name, values in stated.items():
-        numbers = _cells(rows[name])
-        near = 1e-5 * np.max(np.abs(numbers), initial=0.0, where=np.isfinite(numbers))
-        same = (np.abs(numbers - values) <= near) | (np.isnan(numbers) & np.isnan(values))
-        _refuse(~same, where, name, values, lambda row, numbers=numbers: f"{numbers[row]:.9g} there, which {why}")
+        numbers = _to_numbers(rows[name])
+        tolerance = 1e-5 * np.max(np.abs(numbers), initial=0.0, where=np.isfinite(numbers))
+        is_same = (np.abs(numbers - values) <= tolerance) | (np.isnan(numbers) & np.isnan(values))
+        _check_rows(
+            ~is_same, where, name, values, lambda row, numbers=numbers: f"{numbers[row]:.9g} there, which {rule}"
+        )
 
 
-def _all(columns: list[str]) -> str:
+def _column_range(columns: list[str]) -> str:
     return " to ".join((columns[0], columns[-1]))
 
 
-def _refusal(where: str, column: str, row: int, value: object, allowed: str) -> RefusedError:
+def _row_error(where: str, column: str, row: int, value: object, allowed: str) -> RefusedError:
     value = value.to_list() if isinstance(value, pl.Series) else f"{value:.10g}" if isinstance(value, float) else value
     shown = "empty" if value is None else value
     return RefusedError(f"{where} has {column} {shown} in row {row}, but must have {allowed}")
 
 
-def _refuse(
-    bad: np.ndarray, where: str, column: str, values: pl.Series | np.ndarray, allowed: Callable[[int], str]
+def _check_rows(
+    is_bad: np.ndarray, where: str, column: str, values: pl.Series | np.ndarray, allowed: Callable[[int], str]
 ) -> None:
     """Raise RefusedError for the first bad row (rows,) of a column, if any; allowed: words for the row."""
-    if bad.any():
-        row = int(np.argmax(bad))
-        raise _refusal(where, column, row, values[row], allowed(row))
+    if is_bad.any():
+        row = int(np.argmax(is_bad))
+        raise _row_error(where, column, row, values[row], allowed(row))
 
 
-def _numbers(table: pl.DataFrame, column: str, where: str) -> np.ndarray:
+def _finite_numbers(table: pl.DataFrame, column: str, where: str) -> np.ndarray:
     """Return a column of finite numbers."""
-    numbers = _cells(table[column])
-    _refuse(~np.isfinite(numbers), where, column, table[column], lambda _: "a finite number")
+    numbers = _to_numbers(table[column])
+    _check_rows(~np.isfinite(numbers), where, column, table[column], lambda _: "a finite number")
     return numbers
 
 
-def _cells(values: pl.Series) -> np.ndarray:
+def _to_numbers(values: pl.Series) -> np.ndarray:
     """Return the numbers of a column; an empty cell or text is NaN."""
     if values.dtype.is_numeric() or values.dtype == pl.String:
         return values.cast(pl.Float64, strict=False).to_numpy().astype(float)
@@ -230,7 +236,7 @@ def _cells(values: pl.Series) -> np.ndarray:
 
 def _whole_numbers(table: pl.DataFrame, column: str, where: str) -> np.ndarray:
     """Return a column of whole numbers below 2^32."""
-    values = _numbers(table, column, where)
-    bad = (values != np.floor(values)) | (values < 0) | (values >= MOST)
-    _refuse(bad, where, column, table[column], lambda _: f"a whole number from 0 to {MOST - 1}")
+    values = _finite_numbers(table, column, where)
+    is_bad = (values != np.floor(values)) | (values < 0) | (values >= MOST_TRIALS)
+    _check_rows(is_bad, where, column, table[column], lambda _: f"a whole number from 0 to {MOST_TRIALS - 1}")
     return values.astype(np.uint32)

@@ -17,7 +17,7 @@ from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.scenario import Study
 from ptsmc_jax.simulation import requirements, rollout
 from ptsmc_jax.simulation.catalogues import Entry
-from ptsmc_jax.simulation.computer import OURS, Software
+from ptsmc_jax.simulation.computer import PYTHON_SOFTWARE, Software
 from ptsmc_jax.simulation.requirements import Verdict
 from ptsmc_jax.simulation.rollout import Log, Parts
 from ptsmc_jax.theory import lower_bound
@@ -56,13 +56,13 @@ class Run:
 
         None: the run did not reach the end, or its sensors are custom and have no linear model.
         """
-        return lower_bound.along(self.parts, self.log) if self.has_lower_bound else None
+        return lower_bound.bound_along_run(self.parts, self.log) if self.has_lower_bound else None
 
     @property
     def has_lower_bound(self) -> bool:
         """Whether the run has a lower bound, see `lower_bound`."""
-        known = self.parts.sensors.perfect or hasattr(self.parts.sensors, "reading")
-        return known and self.status in montecarlo.FINISHED
+        has_linear_model = self.parts.sensors.perfect or hasattr(self.parts.sensors, "measurement_model")
+        return has_linear_model and self.status in montecarlo.FINISHED
 
     def columns(self) -> dict[str, np.ndarray]:
         """Return the history by column, (time,) each: t [s], state, estimate, delivered torque, s, wheels, modes.
@@ -76,7 +76,7 @@ class Run:
         blocks |= self.parts.plant.hidden_columns(log.x) | self._measured()
         columns = {"t": np.asarray(log.t)}
         for name, block in blocks.items():
-            columns |= numbered(name, block)
+            columns |= numbered_columns(name, block)
         return columns
 
     def _measured(self) -> dict[str, np.ndarray]:
@@ -88,7 +88,7 @@ class Run:
         if log.readings is None or log.sent is None:
             return {}
         readings: dict[str, Any] = dict(log.readings)
-        found: dict[str, Any] = {}
+        columns: dict[str, Any] = {}
         tracker = getattr(sensors, "star_tracker", None)
         if tracker is not None:  # the sensors are a suite
             readings["attitude"] = np.asarray(jax.vmap(tracker.body)(readings[tracker.name]))
@@ -96,23 +96,23 @@ class Run:
                 readings[f"attitude_{name}"] = readings[f"{tracker.name}_{name}"]
         if "attitude" in readings:
             valid = np.asarray(readings.get("attitude_valid", np.ones(len(log.t))), bool)
-            found["measured_q"] = np.where(valid[:, None], readings["attitude"], np.nan)
+            columns["measured_q"] = np.where(valid[:, None], readings["attitude"], np.nan)
         if "attitude_age" in readings:
-            found["measured_age"] = readings["attitude_age"]
+            columns["measured_age"] = readings["attitude_age"]
         names = {"rate": "measured_w", "x": "measured_x"}
-        found |= {new: readings[name] for name, new in names.items() if name in readings}
-        found["sent"] = log.sent
-        return jax.tree.map(np.asarray, found)
+        columns |= {new: readings[name] for name, new in names.items() if name in readings}
+        columns["sent"] = log.sent
+        return jax.tree.map(np.asarray, columns)
 
 
-def numbered(name: str, block: ArrayLike) -> dict[str, np.ndarray]:
+def numbered_columns(name: str, block: ArrayLike) -> dict[str, np.ndarray]:
     """Return the columns of a (time, component) array, named by a number from 1; of a (time,) array, the column."""
     if np.ndim(block) == 1:
         return {name: np.asarray(block)}
     return {f"{name}{k + 1}": column for k, column in enumerate(np.asarray(block).T)}
 
 
-def simulate(ready: Study, seed: int = 0, trial: int | Row | None = None, software: Software = OURS) -> Run:
+def simulate(ready: Study, seed: int = 0, trial: int | Row | None = None, software: Software = PYTHON_SOFTWARE) -> Run:
     """Simulate one run.
 
     Args:
@@ -125,15 +125,17 @@ def simulate(ready: Study, seed: int = 0, trial: int | Row | None = None, softwa
     Returns:
         The run with its verdicts.
     """
-    run = _simulate(ready, seed, trial, software)
-    return replace(run, verdicts=[*run.verdicts, *margin_verdicts.of_loop(run.parts, ready.margins)])
+    run = _simulate_without_margins(ready, seed, trial, software)
+    return replace(run, verdicts=[*run.verdicts, *margin_verdicts.judge_loop(run.parts, ready.margins)])
 
 
-def _simulate(ready: Study, seed: int, trial: int | Row | None, software: Software = OURS) -> Run:
+def _simulate_without_margins(
+    ready: Study, seed: int, trial: int | Row | None, software: Software = PYTHON_SOFTWARE
+) -> Run:
     row = trial if isinstance(trial, Row) else Row(np.uint32(seed), np.uint32(trial or 0), {})
     key, number = np.uint32(row.seed), np.uint32(row.trial)
-    about = trial if isinstance(trial, Row) else number
-    parts = ready.parts if trial is None else _drawn(ready.dispersion, ready.parts, key, about)
+    number_or_row = trial if isinstance(trial, Row) else number
+    parts = ready.parts if trial is None else _dispersed_parts(ready.dispersion, ready.parts, key, number_or_row)
     result = jax.tree.map(
         np.asarray, rollout.single_run_program(parts)(parts, key, number, record=True, software=software)
     )
@@ -151,11 +153,11 @@ def _simulate(ready: Study, seed: int, trial: int | Row | None, software: Softwa
 def prepare(ready: Study) -> None:
     """Start to compile the program for one run of such a study in the background."""
     number = np.uint32(0)
-    rollout.single_run_program(ready.parts).prepare(ready.parts, number, number, record=True, software=OURS)
+    rollout.single_run_program(ready.parts).prepare(ready.parts, number, number, record=True, software=PYTHON_SOFTWARE)
 
 
 @programs.jit
-def _drawn(dispersion: Dispersion, parts: Parts, seed: jax.Array, trial: jax.Array | Row) -> Parts:
+def _dispersed_parts(dispersion: Dispersion, parts: Parts, seed: jax.Array, trial: jax.Array | Row) -> Parts:
     return table_rows.about(parts, dispersion, seed, trial).drawn
 
 
@@ -172,5 +174,7 @@ def rms_lower_bound(ready: Study, seed: int = 0, rows: Sequence[int | Row] = ())
         The bound, or None if no run has one.
     """
     trials = rows or (range(BOUND_TRIALS) if ready.dispersion.varies else (None,))
-    runs = [_simulate(ready, seed, trial) for trial in trials]
-    return lower_bound.pooled(lower_bound.along_each([(run.parts, run.log) for run in runs if run.has_lower_bound]))
+    runs = [_simulate_without_margins(ready, seed, trial) for trial in trials]
+    return lower_bound.pool_bounds(
+        lower_bound.bounds_along_runs([(run.parts, run.log) for run in runs if run.has_lower_bound])
+    )

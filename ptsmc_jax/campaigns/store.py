@@ -31,7 +31,7 @@ except ImportError:  # Windows has no fcntl
 JOURNAL = "journal.bin"  # file of an unfinished run
 SUMMARY = "summary.json"  # file of a finished run
 IDENTITY = (SUMMARY, "versions.json", "scenario.toml")  # files that differ between results
-MAKING = ".making-"  # marks the names of temporary files and folders
+TEMPORARY_PREFIX = ".making-"  # beginning of the names of temporary files and folders
 MADE_OF_RESULTS = {  # files made from a result, with a mark near their beginning; other files are the user's and stay
     "figures/*.png": b"Creator\0ptsmc",  # written by `style.save`
     "report.html": b'<meta name="generator" content="ptsmc">',
@@ -54,10 +54,10 @@ class InUseError(RefusedError):
 def versions(command: str, seed: int | None, **others: object) -> dict[str, Any]:
     """Return the content of versions.json: command, seed (None: no random numbers), versions, machine."""
     command_line = shlex.join([*(Path(program).name for program in sys.argv[:1]), *sys.argv[1:]])
-    return {"command": command, "seed": seed, **others, COMMAND_LINE: command_line, **_surroundings()}
+    return {"command": command, "seed": seed, **others, COMMAND_LINE: command_line, **_environment()}
 
 
-def _surroundings() -> dict[str, str]:
+def _environment() -> dict[str, str]:
     """Return the versions and the machine. An interrupted run resumes only with the same ones."""
     machine = {"platform": platform.platform(), "machine": platform.machine()}
     return {"python": platform.python_version(), **packages(), **machine}
@@ -82,34 +82,34 @@ def _read_json(path: Path) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def previous(folder: Path, scenario: Tables, made_by: Tables) -> dict[str, Any] | None:
+def read_previous_summary(folder: Path, scenario: Tables, made_by: Tables) -> dict[str, Any] | None:
     """Return the summary of the same scenario, command, seed and other inputs (`versions`); None if there is none."""
-    summary = {} if difference(folder, scenario, made_by) else _read_json(folder / SUMMARY)
+    summary = {} if describe_difference(folder, scenario, made_by) else _read_json(folder / SUMMARY)
     return summary if "status" in summary else None
 
 
-def begun(folder: Path, scenario: Tables, made_by: Tables) -> bool:
-    """Return whether the folder contains this run and it is incomplete, see `begin`.
+def has_unfinished_run(folder: Path, scenario: Tables, made_by: Tables) -> bool:
+    """Return whether the folder contains this run and it is incomplete, see `begin_run`.
 
     Raises:
         RefusedError: it contains another unfinished run, or one of other versions.
     """
     if not (folder / JOURNAL).exists():
         return False
-    refuse_others(folder, scenario, {**made_by, **_surroundings()})
+    refuse_other_run(folder, scenario, {**made_by, **_environment()})
     return True
 
 
-def refuse_others(folder: Path, scenario: Tables, made_by: Tables) -> None:
-    """Raise RefusedError if the folder holds another run than this: see `difference`."""
-    other = difference(folder, scenario, made_by)
+def refuse_other_run(folder: Path, scenario: Tables, made_by: Tables) -> None:
+    """Raise RefusedError if the folder holds another run than this: see `describe_difference`."""
+    other = describe_difference(folder, scenario, made_by)
     if other is not None:
         raise RefusedError(
             f"--out is {folder}, which holds {other}; allowed is a new folder, or --force to start again"
         )
 
 
-def begin(folder: Path, scenario: Tables, made_by: Tables, *, fresh: bool) -> Path:
+def begin_run(folder: Path, scenario: Tables, made_by: Tables, *, fresh: bool) -> Path:
     """Make the folder of a run that can be resumed; return the path of its journal.
 
     Args:
@@ -119,13 +119,13 @@ def begin(folder: Path, scenario: Tables, made_by: Tables, *, fresh: bool) -> Pa
         fresh: start again: empty the journal and remove the summary.
     """
 
-    def fill(making: Path) -> None:
-        record(making, scenario, made_by)
+    def fill(temporary: Path) -> None:
+        write_run_files(temporary, scenario, made_by)
         if fresh:
-            (making / JOURNAL).touch()
+            (temporary / JOURNAL).touch()
             remove_summary(folder)
 
-    write(folder, fill)
+    write_folder(folder, fill)
     return folder / JOURNAL
 
 
@@ -133,44 +133,44 @@ def remove_summary(folder: Path) -> None:
     """Remove the summary of a result and the files made from it, which would not belong to the next result."""
     if not ((folder / SUMMARY).exists() or "command" in read_versions(folder)):
         return
-    for pattern, mark in MADE_OF_RESULTS.items():
+    for pattern, marker in MADE_OF_RESULTS.items():
         for path in folder.glob(pattern):
             with contextlib.suppress(FileNotFoundError, IsADirectoryError):  # another shard may have removed the file
-                if mark in path.read_bytes()[:1024]:
+                if marker in path.read_bytes()[:1024]:
                     path.unlink()
     (folder / SUMMARY).unlink(missing_ok=True)
 
 
-def _alike(new: Path, old: Path) -> bool:
+def _is_equal(new: Path, old: Path) -> bool:
     """Return whether two files are equal. The command line in `versions.json` is ignored."""
     if new.name == "versions.json":
-        made = [{**read_versions(path.parent), COMMAND_LINE: None} for path in (new, old)]
-        return made[0] == made[1]
+        versions_of_both = [{**read_versions(path.parent), COMMAND_LINE: None} for path in (new, old)]
+        return versions_of_both[0] == versions_of_both[1]
     return old.exists() and new.read_bytes() == old.read_bytes()
 
 
-def end(folder: Path) -> None:
+def end_run(folder: Path) -> None:
     """Remove the journal of a finished run."""
     (folder / JOURNAL).unlink(missing_ok=True)
 
 
-def difference(folder: Path, scenario: Tables, made_by: Tables) -> str | None:
+def describe_difference(folder: Path, scenario: Tables, made_by: Tables) -> str | None:
     """Return in words how the run in the folder differs from this run; None if it does not."""
     versions = read_versions(folder)
     try:
-        old_tables = parsing.toml((folder / "scenario.toml").read_text(encoding="utf-8"), "scenario.toml")
+        old_tables = parsing.parse_toml((folder / "scenario.toml").read_text(encoding="utf-8"), "scenario.toml")
     except (OSError, ValueError):
         return "files, but no scenario.toml of a run that can be read"
     if not versions:
         return "files, but no versions.json of a run that can be read"
-    old_values, new_values = _values(old_tables), _values(json.loads(json.dumps(_named(scenario))))
+    old_values, new_values = _values_by_key(old_tables), _values_by_key(json.loads(json.dumps(_name_objects(scenario))))
     for name, value in made_by.items():
         old = versions.get(name)
         if name == CODE and old is not None and old != value:
             return f"a run of another version of the source code (checksum {old}, not {value})"
         if old != value:
-            here = "which is not used here" if value is None else f"not {value}"
-            return f"a run without {name}" if old is None else f"a run with {name} {old}, {here}"
+            this_run = "which is not used here" if value is None else f"not {value}"
+            return f"a run without {name}" if old is None else f"a run with {name} {old}, {this_run}"
     for key in dict.fromkeys((*old_values, *new_values)):
         old, new = old_values.get(key, "absent"), new_values.get(key, "absent")
         if old != new:
@@ -178,7 +178,7 @@ def difference(folder: Path, scenario: Tables, made_by: Tables) -> str | None:
     return None
 
 
-def _values(tables: Tables) -> dict[str, Any]:
+def _values_by_key(tables: Tables) -> dict[str, Any]:
     """Return the values of a scenario by the names of their keys, such as loop.period or sensors[0].period."""
     values: dict[str, Any] = {}
     for name, content in tables.items():
@@ -188,30 +188,32 @@ def _values(tables: Tables) -> dict[str, Any]:
     return values
 
 
-def check(folder: Path, force: bool) -> None:
+def check_folder(folder: Path, force: bool) -> None:
     """Raise RefusedError if this folder must not be written to; force: it may have content."""
-    there = next(path for path in (folder, *folder.parents) if path.exists())
-    if not there.is_dir():
-        which = "which" if there == folder else f"but {there}"
-        raise RefusedError(f"--out is {folder}, {which} is a file; allowed is a new folder")
-    if not os.access(there, os.W_OK):
-        raise RefusedError(f"--out is {folder}, but nothing may be written into {there}; allowed is a folder elsewhere")
-    if there == folder and not force and not is_empty(folder):
+    existing = next(path for path in (folder, *folder.parents) if path.exists())
+    if not existing.is_dir():
+        place = "which" if existing == folder else f"but {existing}"
+        raise RefusedError(f"--out is {folder}, {place} is a file; allowed is a new folder")
+    if not os.access(existing, os.W_OK):
+        raise RefusedError(
+            f"--out is {folder}, but nothing may be written into {existing}; allowed is a folder elsewhere"
+        )
+    if existing == folder and not force and not is_empty(folder):
         raise RefusedError(
             f"--out is {folder}, which holds something already; allowed is a new folder, or --force to write into it"
         )
 
 
 def is_empty(folder: Path) -> bool:
-    """Return whether a folder is empty, except for the lock file of `in_use`."""
+    """Return whether a folder is empty, except for the lock file of `lock_folder`."""
     return all(path.name == _lock_file(folder).name for path in folder.iterdir())
 
 
 @contextlib.contextmanager
-def in_use(folder: Path, *, force: bool = True, shared: bool = False) -> Iterator[None]:
+def lock_folder(folder: Path, *, force: bool = True, shared: bool = False) -> Iterator[None]:
     """Lock a result folder while this process writes into it; the lock ends with the process, even if it is killed.
 
-    At the end, the last process that holds the lock removes the temporary folders of killed ones, see `write`.
+    At the end, the last process that holds the lock removes the temporary folders of killed ones, see `write_folder`.
     Platforms without `fcntl` and file systems without locks are not protected.
 
     Args:
@@ -221,41 +223,41 @@ def in_use(folder: Path, *, force: bool = True, shared: bool = False) -> Iterato
 
     Raises:
         InUseError: another process writes into the folder.
-        RefusedError: see `check`.
+        RefusedError: see `check_folder`.
     """
-    check(folder, force=True)  # before a folder or a file is made
+    check_folder(folder, force=True)  # before a folder or a file is made
     path = _lock_file(folder)
-    made = [parent for parent in path.parents if not parent.exists()]
-    lock = _locked(path, shared=shared)
+    new_parents = [parent for parent in path.parents if not parent.exists()]
+    lock = _open_locked(path, shared=shared)
     if lock is None:
         raise InUseError(f"{folder} is in use by another ptsmc process; wait for its end, or choose another folder")
     try:
-        check(folder, force)
+        check_folder(folder, force)
         yield
     finally:
         with contextlib.suppress(OSError), lock:
-            if _flock(lock, shared=False):  # raises an error if other processes share the lock
-                for left in path.parent.glob(f"{glob.escape(path.stem)}{MAKING}????????"):
-                    shutil.rmtree(left, ignore_errors=True)
+            if _lock(lock, shared=False):  # raises an error if other processes share the lock
+                for leftover in path.parent.glob(f"{glob.escape(path.stem)}{TEMPORARY_PREFIX}????????"):
+                    shutil.rmtree(leftover, ignore_errors=True)
             path.unlink()
-        for parent in made:
+        for parent in new_parents:
             with contextlib.suppress(OSError):  # the folder is not empty
                 parent.rmdir()
 
 
 def _lock_file(folder: Path) -> Path:
     folder = Path(os.path.realpath(folder))
-    return _beside(folder) / f".{folder.name}.lock"
+    return _temporary_place(folder) / f".{folder.name}.lock"
 
 
-def _locked(path: Path, *, shared: bool) -> IO[str] | None:
+def _open_locked(path: Path, *, shared: bool) -> IO[str] | None:
     """Open and lock a file; return None if another process holds the lock."""
     for _ in range(30):  # another process may release or remove the lock file at this moment
         with contextlib.suppress(BlockingIOError, FileNotFoundError):
             path.parent.mkdir(parents=True, exist_ok=True)
             file = path.open("a+")
             try:
-                _flock(file, shared=shared)
+                _lock(file, shared=shared)
                 if os.path.samestat(os.fstat(file.fileno()), path.stat()):
                     return file
             except BaseException:
@@ -266,7 +268,7 @@ def _locked(path: Path, *, shared: bool) -> IO[str] | None:
     return None
 
 
-def _flock(file: IO[str], *, shared: bool) -> bool:
+def _lock(file: IO[str], *, shared: bool) -> bool:
     """Lock an open file; return False without locks. Raises BlockingIOError if another process holds the lock."""
     if fcntl is None:
         return False
@@ -279,18 +281,18 @@ def _flock(file: IO[str], *, shared: bool) -> bool:
     return True
 
 
-def check_file(file: Path, force: bool, way: str = "--force") -> None:
-    """Raise RefusedError if this file must not be written; way: the option for `force`."""
+def check_file(file: Path, force: bool, option: str = "--force") -> None:
+    """Raise RefusedError if this file must not be written; option: the option for `force`."""
     if not file.parent.is_dir():
         raise RefusedError(
             f"the file is {file}, but {file.parent} is no folder; allowed is a file in an existing folder"
         )
     if file.is_dir() or (file.exists() and not force):
-        allowed = "another name" if file.is_dir() else f"another name, or {way} to write over it"
+        allowed = "another name" if file.is_dir() else f"another name, or {option} to write over it"
         raise RefusedError(f"the file is {file}, which exists already; allowed is {allowed}")
 
 
-def write(folder: Path, fill: Callable[[Path], None]) -> None:
+def write_folder(folder: Path, fill: Callable[[Path], None]) -> None:
     """Write a result folder: `fill` writes into a temporary folder, whose files are then moved.
 
     If the folder contains another result, see `IDENTITY`, its summary, figures and tables are removed. versions.json is
@@ -298,27 +300,27 @@ def write(folder: Path, fill: Callable[[Path], None]) -> None:
     """
     folder = Path(os.path.realpath(folder))
     folder.parent.mkdir(parents=True, exist_ok=True)
-    making = _beside(folder) / f".{folder.name}{MAKING}{secrets.token_hex(4)}"
-    making.mkdir()
+    temporary = _temporary_place(folder) / f".{folder.name}{TEMPORARY_PREFIX}{secrets.token_hex(4)}"
+    temporary.mkdir()
     try:
-        fill(making)
+        fill(temporary)
         if not folder.exists():
             with contextlib.suppress(OSError):  # another shard has made the folder
-                making.rename(folder)
+                temporary.rename(folder)
                 return
         order = {"versions.json": -1, SUMMARY: 1}
-        files = (path for path in making.rglob("*") if path.is_file())
-        if any((making / name).exists() and not _alike(making / name, folder / name) for name in IDENTITY):
+        files = (path for path in temporary.rglob("*") if path.is_file())
+        if any((temporary / name).exists() and not _is_equal(temporary / name, folder / name) for name in IDENTITY):
             remove_summary(folder)
         for path in sorted(files, key=lambda path: order.get(path.name, 0)):
-            target = folder / path.relative_to(making)
+            target = folder / path.relative_to(temporary)
             target.parent.mkdir(parents=True, exist_ok=True)
             os.replace(path, target)
     finally:
-        shutil.rmtree(making, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
-def _beside(folder: Path) -> Path:
+def _temporary_place(folder: Path) -> Path:
     """Return the place for temporary files of a result folder: its parent if that is possible, otherwise itself.
 
     folder: its path without links.
@@ -327,7 +329,7 @@ def _beside(folder: Path) -> Path:
     return folder if inside else folder.parent
 
 
-def record(folder: Path, scenario: Tables, made_by: Tables, summary: Tables | None = None) -> None:
+def write_run_files(folder: Path, scenario: Tables, made_by: Tables, summary: Tables | None = None) -> None:
     """Write the files of every result folder: scenario.toml, versions.json, and the summary if there is one."""
     write_toml(folder / "scenario.toml", scenario)
     write_json(folder / "versions.json", versions(**made_by))
@@ -337,69 +339,69 @@ def record(folder: Path, scenario: Tables, made_by: Tables, summary: Tables | No
 
 def write_toml(path: Path, tables: Tables) -> None:
     """Write a TOML file, with arrays on one line."""
-    text, before = tomli_w.dumps(_named(tables)), ""
+    text, before = tomli_w.dumps(_name_objects(tables)), ""
     while text != before:  # the innermost arrays are joined first
-        text, before = re.sub(r"\[\n((?: +[^\]\s][^\n]*,\n)+) *\]", _one_line, text), text
+        text, before = re.sub(r"\[\n((?: +[^\]\s][^\n]*,\n)+) *\]", _join_array, text), text
     write_text(path, text)
 
 
 def write_json(path: Path, value: object) -> None:
     """Write a JSON file; numbers that are not finite become null."""
-    write_text(path, json.dumps(plain(value), indent=2, allow_nan=False) + "\n")
+    write_text(path, json.dumps(to_json_value(value), indent=2, allow_nan=False) + "\n")
 
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file as a whole; bytes that are not UTF-8, from names of files, become escapes."""
-    with replacing(path) as making:
-        making.write_text(text, encoding="utf-8", errors="backslashreplace")
+    with replace_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
     """Write a CSV file as a whole; numbers have enough digits to be read back exactly."""
-    with replacing(path) as making, making.open("w", newline="", encoding="utf-8") as file:
+    with replace_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(header)
         writer.writerows([value.item() if hasattr(value, "item") else value for value in row] for row in rows)
 
 
 @contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary file beside it, which is then moved into place, or removed after an error."""
-    making = path.with_name(f"{MAKING}{secrets.token_hex(8)}")
+def replace_file(path: Path) -> Iterator[Path]:
+    """Yield a temporary file that replaces `path` at the end, or is removed after an error."""
+    temporary = path.with_name(f"{TEMPORARY_PREFIX}{secrets.token_hex(8)}")
     try:
-        yield making
-        os.replace(making, path)
+        yield temporary
+        os.replace(temporary, path)
     except OSError as error:
         if error.filename is not None:
             error.filename = str(path)  # name this file in the error, not the temporary file
         raise
     finally:
         with contextlib.suppress(OSError):
-            making.unlink()
+            temporary.unlink()
 
 
-def _one_line(array: re.Match[str]) -> str:
+def _join_array(array: re.Match[str]) -> str:
     return "[" + ", ".join(item.strip().removesuffix(",") for item in array[1].rstrip("\n").split("\n")) + "]"
 
 
-def plain(value: Any) -> Any:
+def to_json_value(value: Any) -> Any:
     """Return a value for a JSON file: numbers, lists, dicts; None for a number that is not finite."""
     if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
+        return {str(k): to_json_value(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(v) for v in value]
+        return [to_json_value(v) for v in value]
     if hasattr(value, "tolist"):
-        return plain(value.tolist())
+        return to_json_value(value.tolist())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
 
 
-def _named(value: Any) -> Any:
+def _name_objects(value: Any) -> Any:
     """Return tables with names instead of objects made in Python; reading refuses such a name."""
     if isinstance(value, Mapping):
-        return {k: _named(v) for k, v in value.items()}
+        return {k: _name_objects(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [_named(v) for v in value]
+        return [_name_objects(v) for v in value]
     kind = value if isinstance(value, type) else type(value)
     return value if isinstance(value, bool | int | float | str) else f"<{kind.__name__} made in Python>"

@@ -47,7 +47,7 @@ class AppliedTorque(NamedTuple):
     stored: Array | None  # (m,) momentum A h at the start [N m s]; None without wheels
     dt: Array  # [s]
 
-    def at(self, s: Scalar, w: Vector) -> Vector:
+    def torque_at(self, s: Scalar, w: Vector) -> Vector:
         """Return the torque u - w x A h [N m] at s [s] from the start, with (A h)' = -u and body rate w [rad/s]."""
         u, impulse = self.mean, self.mean * s
         if self.slope is not None:
@@ -74,16 +74,16 @@ class Actuators:
     spare_allocations: Leaf | None = None  # (wheels, wheels, 3) allocation without each wheel, if failures are known
 
     @property
-    def ideal(self) -> bool:
+    def is_ideal(self) -> bool:
         """Whether the actuators deliver every command immediately and exactly."""
-        return not self.delay and all(getattr(self, one.name) is None for one in fields(self) if one.name != "delay")
+        return not self.delay and all(getattr(self, f.name) is None for f in fields(self) if f.name != "delay")
 
     @property
     def nominal(self) -> "Actuators":
         """The actuators as the flight software knows them, without hardware errors."""
         return replace(self, scale=None, directions=None, failure_times=None)
 
-    def assumed(self, drive: Drive, dt: Scalar) -> tuple[Vector, Vector | None]:
+    def assumed_torque(self, drive: Drive, dt: Scalar) -> tuple[Vector, Vector | None]:
         """Return the torque and momentum that the flight software assumes for a period of dt [s].
 
         The result is the mean torque (m,) [N m], and the wheels' momentum in the middle of the period (m,) [N m s], or
@@ -91,10 +91,10 @@ class Actuators:
         """
         if self.spare_allocations is None:  # the flight software does not know of failures
             drive = drive._replace(works=None)
-        torque = self.nominal.over(drive, jnp.zeros_like(dt), dt)
+        torque = self.nominal.torque_over(drive, jnp.zeros_like(dt), dt)
         return torque.mean, None if torque.stored is None else torque.stored - torque.mean * dt / 2
 
-    def delivered(self, drive: Drive, v: Array) -> Array:
+    def true_torque(self, drive: Drive, v: Array) -> Array:
         """Return the true torques of the channels (channels,) [N m] from nominal torques, or from their integrals."""
         scaled = v if self.scale is None else self.scale * v
         return scaled if drive.works is None else jnp.where(drive.works, scaled, 0.0)
@@ -107,22 +107,22 @@ class Actuators:
         return v if axes is None else axes @ v
 
     @property
-    def moves(self) -> bool:
+    def has_dynamics(self) -> bool:
         """Whether the torque changes within a period."""
         return self.rate_limit is not None or self.lag is not None
 
     @property
-    def holds(self) -> bool:
+    def is_exact_hold(self) -> bool:
         """Whether the torque on the body is the target from the start of a period to its end."""
-        fits = self.scale is None and self.directions is None and self.failure_times is None
-        return fits and not self.moves and self.wheels is None
+        has_no_errors = self.scale is None and self.directions is None and self.failure_times is None
+        return has_no_errors and not self.has_dynamics and self.wheels is None
 
     def begin(self, inputs: int) -> ActuatorState:
         """Return the initial state: no torque acts, and no command is delayed."""
         queue = jnp.zeros((self.delay, inputs)) if self.delay else None
         momentum = None if self.wheels is None else self.wheels.initial
-        rest = jnp.zeros(inputs) if momentum is None else jnp.zeros_like(momentum)
-        return ActuatorState(queue, None if self.holds else rest, momentum)
+        no_torque = jnp.zeros(inputs) if momentum is None else jnp.zeros_like(momentum)
+        return ActuatorState(queue, None if self.is_exact_hold else no_torque, momentum)
 
     def command(
         self, state: ActuatorState, u: Vector, w: Vector, t: Scalar, dt: Scalar, weight: Scalar
@@ -130,21 +130,21 @@ class Actuators:
         """Return the drive of a control period, and the queue of commands after it.
 
         Args:
-            state: at the start of the period.
+            state: state at the start of the period.
             u: command of the law, (m,) [N m].
             w: measured rate, (m,) [rad/s].
             t: start of the period [s].
-            dt: its length [s].
+            dt: length of the period [s].
             weight: length of a partial first period as a fraction of a full one. The command has this weight in the
                 queue, so that the result is continuous when the length goes to 0.
         """
         sent, limited = self.send(state, u, w)
-        queue, due = state.queue, sent
+        queue, command_now = state.queue, sent
         if queue is not None:
-            due = queue[0]
-            advanced = jnp.concatenate([queue[1:], guards.lerp(weight, sent, queue[-1])[None]])
-            queue = jnp.where(dt > 0.0, advanced, queue)
-        drive = self.drive(state, due, t, dt)
+            command_now = queue[0]
+            next_queue = jnp.concatenate([queue[1:], guards.lerp(weight, sent, queue[-1])[None]])
+            queue = jnp.where(dt > 0.0, next_queue, queue)
+        drive = self.drive(state, command_now, t, dt)
         return drive._replace(limited=limited | drive.limited), queue
 
     def send(self, state: ActuatorState, u: Vector, w: Vector) -> tuple[Vector, Array]:
@@ -154,7 +154,7 @@ class Actuators:
         applies to the sum.
 
         Args:
-            state: at the start of the period.
+            state: state at the start of the period.
             u: command of the law, (m,) [N m].
             w: measured rate, (m,) [rad/s].
         """
@@ -169,10 +169,10 @@ class Actuators:
         """Return the drive of a control period.
 
         Args:
-            state: at the start of the period.
+            state: state at the start of the period.
             due: command that acts in the period, after the delay, (m,) [N m]; see `send`.
             t: start of the period [s].
-            dt: its length [s].
+            dt: length of the period [s].
         """
         target = due
         if self.wheels is not None:
@@ -183,14 +183,14 @@ class Actuators:
                 target = jnp.clip(target, -self.torque_limit, self.torque_limit)
         c = target
         if self.wheels is not None:
-            c = self._within_wheels(self.wheels, target, state, dt)
+            c = self._limit_wheel_torques(self.wheels, target, state, dt)
         limited = jnp.any(c != target)
         if self.rate_limit is not None:
             assert state.v is not None
-            farthest = self.rate_limit * (dt if self.lag is None else dt + self.lag)
-            limited = limited | jnp.any(jnp.abs(c - state.v) > farthest)
+            largest_change = self.rate_limit * (dt if self.lag is None else dt + self.lag)
+            limited = limited | jnp.any(jnp.abs(c - state.v) > largest_change)
         works = None if self.failure_times is None else t < self.failure_times
-        return Drive(state.v if self.moves else None, c, state.h, limited, works)
+        return Drive(state.v if self.has_dynamics else None, c, state.h, limited, works)
 
     def _allocation(self, device: Wheels, t: Scalar) -> Float[Array, "wheels 3"]:
         """Return the matrix that allocates a torque to the wheels at t [s], except to a wheel with a known failure."""
@@ -200,7 +200,7 @@ class Actuators:
         spare = jnp.sum(jnp.where(failed[:, None, None], self.spare_allocations, 0.0), axis=0)
         return jnp.where(jnp.any(failed), spare, device.allocation)
 
-    def _within_wheels(self, device: Wheels, v: Array, state: ActuatorState, dt: Scalar) -> Array:
+    def _limit_wheel_torques(self, device: Wheels, v: Array, state: ActuatorState, dt: Scalar) -> Array:
         """Return wheel torques within the torque limit and, at the end of the period, within the momentum limit.
 
         With a lag the impulse of the period is c (dt - a) + v a, where a = lag (1 - e^(-dt/lag)). The momentum may
@@ -208,17 +208,19 @@ class Actuators:
         """
         if device.momentum_limit is not None:
             assert state.h is not None
-            h, a = state.h, jnp.zeros_like(dt)
+            h, lag_span = state.h, jnp.zeros_like(dt)
             if self.lag is not None and state.v is not None:
-                a = self.lag * -jnp.expm1(-dt / self.lag)
-                h = h - a * state.v
-            per_span = 1.0 / jnp.where(dt > a, dt - a, 1.0)  # one division for all trials and wheels
-            v = jnp.clip(v, per_span * (h - device.momentum_limit), per_span * (h + device.momentum_limit))
+                lag_span = self.lag * -jnp.expm1(-dt / self.lag)
+                h = h - lag_span * state.v
+            inverse_span = 1.0 / jnp.where(
+                dt > lag_span, dt - lag_span, 1.0
+            )  # multiplied below, because a division is slower
+            v = jnp.clip(v, inverse_span * (h - device.momentum_limit), inverse_span * (h + device.momentum_limit))
         if device.torque_limit is not None:
             v = jnp.clip(v, -device.torque_limit, device.torque_limit)
         return v
 
-    def channels(self, drive: Drive, s: Scalar) -> tuple[Array, Array, Array]:
+    def channel_torques(self, drive: Drive, s: Scalar) -> tuple[Array, Array, Array]:
         """Return the nominal torque of each channel s [s] into the period, its integral, and the integral of that.
 
         The units are [N m, N m s, N m s^2]. The torque obeys v' = (c - v) / lag with |v'| at most the rate limit. It is
@@ -228,33 +230,37 @@ class Actuators:
         if v is None:
             return c, c * s, c * (s * s / 2)
         # with a rate limit each channel has a ramp of its own duration; without one all channels share their times
-        gap, span, first, second = c - v, s, 0.0, 0.0
-        ramping, torque_on_ramp = None, c
+        gap, span, ramp_integral, ramp_double_integral = c - v, s, 0.0, 0.0
+        is_ramping, torque_on_ramp = None, c
         if self.rate_limit is not None:
             ramp_rate = self.rate_limit * jnp.sign(gap)
-            by_lag = 0.0 * self.rate_limit if self.lag is None else self.rate_limit * self.lag
-            lag_gap = jnp.clip(gap, -by_lag, by_lag)
-            ramp = jnp.abs(gap - lag_gap) / self.rate_limit
-            ramping, gap, span = s < ramp, lag_gap, jnp.maximum(s - ramp, 0.0)
-            on_ramp = jnp.where(ramping, s, ramp)
+            largest_lag_gap = 0.0 * self.rate_limit if self.lag is None else self.rate_limit * self.lag
+            lag_gap = jnp.clip(gap, -largest_lag_gap, largest_lag_gap)
+            ramp_duration = jnp.abs(gap - lag_gap) / self.rate_limit
+            is_ramping, gap, span = s < ramp_duration, lag_gap, jnp.maximum(s - ramp_duration, 0.0)
+            ramp_time = jnp.where(is_ramping, s, ramp_duration)
             torque_on_ramp = v + ramp_rate * s
-            first = on_ramp * (v + ramp_rate * on_ramp / 2)
-            second = on_ramp * on_ramp * (v / 2 + ramp_rate * on_ramp / 6)
-        left = area = twice = 0.0  # the remaining gap c - v of the lag, and its two integrals
+            ramp_integral = ramp_time * (v + ramp_rate * ramp_time / 2)
+            ramp_double_integral = ramp_time * ramp_time * (v / 2 + ramp_rate * ramp_time / 6)
+        lag_gap_left = gap_integral = gap_double_integral = 0.0  # remaining gap c - v of the lag, and its integrals
         if self.lag is not None:
-            left = gap * jnp.exp(-span / self.lag)
-            area = gap * (self.lag * -jnp.expm1(-span / self.lag))
-            twice = self.lag * (gap * span - area)
-        torque = c - left if ramping is None else jnp.where(ramping, torque_on_ramp, c - left)
-        return torque, first + c * span - area, second + first * span + c * (span * span / 2) - twice
+            lag_gap_left = gap * jnp.exp(-span / self.lag)
+            gap_integral = gap * (self.lag * -jnp.expm1(-span / self.lag))
+            gap_double_integral = self.lag * (gap * span - gap_integral)
+        torque = c - lag_gap_left if is_ramping is None else jnp.where(is_ramping, torque_on_ramp, c - lag_gap_left)
+        return (
+            torque,
+            ramp_integral + c * span - gap_integral,
+            ramp_double_integral + ramp_integral * span + c * (span * span / 2) - gap_double_integral,
+        )
 
-    def at(self, drive: Drive, s: Scalar) -> tuple[Array, Array | None]:
+    def torque_and_momentum(self, drive: Drive, s: Scalar) -> tuple[Array, Array | None]:
         """Return the true torque of each channel [N m] s [s] into the period, and the wheels' momentum [N m s]."""
-        v, impulse, _ = self.channels(drive, s)
-        momentum = None if drive.h is None else drive.h - self.delivered(drive, impulse)
-        return self.delivered(drive, v), momentum
+        v, impulse, _ = self.channel_torques(drive, s)
+        momentum = None if drive.h is None else drive.h - self.true_torque(drive, impulse)
+        return self.true_torque(drive, v), momentum
 
-    def over(self, drive: Drive, start: Scalar, dt: Scalar) -> AppliedTorque:
+    def torque_over(self, drive: Drive, start: Scalar, dt: Scalar) -> AppliedTorque:
         """Return the torque over a part of the period, linear in time, with exact impulse and first moment.
 
         The momentum after an integration step is therefore exact, and the attitude is exact to leading order, even if
@@ -266,34 +272,35 @@ class Actuators:
             dt: length of the part [s].
         """
         v, slope, has_length = drive.c, None, dt > 0.0
-        _, first, _ = self.channels(drive, start)
+        _, impulse_before, _ = self.channel_torques(drive, start)
         if drive.v is not None:
             # with a lag alone the torque of each channel is c plus its gap times a common decay from 1 to 0
-            gap, moving = drive.v - drive.c, drive
+            gap, unit_drive = drive.v - drive.c, drive
             if self.rate_limit is None:
-                moving = drive._replace(v=jnp.ones_like(dt), c=jnp.zeros_like(dt))
-            _, begun, begun_twice = self.channels(moving, start)
-            _, ended, ended_twice = self.channels(moving, start + dt)
-            per_length = 1.0 / jnp.where(has_length, dt, 1.0)
-            mean = (ended - begun) * per_length
-            moment = (begun + ended) / 2 * dt - (ended_twice - begun_twice)  # of the torque about the middle
-            tilt = jnp.where(has_length, 12.0 * moment * per_length**3, 0.0)
+                unit_drive = drive._replace(v=jnp.ones_like(dt), c=jnp.zeros_like(dt))
+            _, integral_0, double_integral_0 = self.channel_torques(unit_drive, start)
+            _, integral_1, double_integral_1 = self.channel_torques(unit_drive, start + dt)
+            inverse_length = 1.0 / jnp.where(has_length, dt, 1.0)
+            mean = (integral_1 - integral_0) * inverse_length
+            # first moment of the torque about the middle
+            moment = (integral_0 + integral_1) / 2 * dt - (double_integral_1 - double_integral_0)
+            rate = jnp.where(has_length, 12.0 * moment * inverse_length**3, 0.0)
             if self.rate_limit is None:
-                mean, tilt = drive.c + gap * mean, gap * tilt
-            v, slope = jnp.where(has_length, mean, drive.v), tilt
-        stored = None if drive.h is None else self.on_body(drive.h - self.delivered(drive, first))
-        mean = self.on_body(self.delivered(drive, v))
-        return AppliedTorque(mean, None if slope is None else self.on_body(self.delivered(drive, slope)), stored, dt)
+                mean, rate = drive.c + gap * mean, gap * rate
+            v, slope = jnp.where(has_length, mean, drive.v), rate
+        stored = None if drive.h is None else self.on_body(drive.h - self.true_torque(drive, impulse_before))
+        mean = self.on_body(self.true_torque(drive, v))
+        return AppliedTorque(mean, None if slope is None else self.on_body(self.true_torque(drive, slope)), stored, dt)
 
     def end(self, state: ActuatorState, drive: Drive, queue: Array | None, dt: Scalar) -> ActuatorState:
         """Return the state after a period; a period of length zero changes nothing.
 
         Args:
-            state: at the start of the period.
+            state: state at the start of the period.
             drive: the drive of the period.
             queue: delayed commands after the period, see `command`.
             dt: length of the period [s].
         """
-        v, impulse, _ = self.channels(drive, dt)
+        v, impulse, _ = self.channel_torques(drive, dt)
         v = None if state.v is None else jnp.where(dt > 0.0, v, state.v)
-        return ActuatorState(queue, v, None if drive.h is None else drive.h - self.delivered(drive, impulse))
+        return ActuatorState(queue, v, None if drive.h is None else drive.h - self.true_torque(drive, impulse))

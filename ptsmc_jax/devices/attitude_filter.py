@@ -156,28 +156,28 @@ def attitude_filter(
     # `walk` and `star`.
     zero, one, half = jnp.zeros_like(k1), jnp.ones_like(k1), period / 2
 
-    def after(t: Any) -> Array:
+    def propagation(t: Any) -> Array:
         return jnp.array([[one, -t * one], [zero, one]])
 
-    def square(vector: Array, sigma: Any) -> Array:
+    def noise_covariance(vector: Array, sigma: Any) -> Array:
         return jnp.outer(vector, vector) * sigma**2
 
     gyro, walk = jnp.stack([half * one, zero]), jnp.sqrt(period) * jnp.stack([half * one, -one])
-    corrected = after(period) @ jnp.array([[1.0 - k1, zero], [k2, one]])
-    star = after(period) @ jnp.stack([k1, -k2])
-    drive = square(2.0 * gyro, rate_noise) + square(walk, bias_walk)
-    steps = jax.vmap(after)(period * jnp.arange(every).astype(float))
-    increments = jax.vmap(lambda step: step @ drive @ step.T)(steps)
-    added = jnp.cumsum(increments, axis=0) - increments  # covariance accumulated since the star tracker sample
-    move = corrected @ steps[-1]
-    drive = corrected @ added[-1] @ corrected.T + square(star, attitude_noise)
-    drive = drive + square(corrected @ gyro + gyro, rate_noise) + square(walk, bias_walk)
-    first = matrices.solve(jnp.eye(4) - jnp.kron(move, move), drive.reshape(4)).reshape(2, 2)
+    corrected = propagation(period) @ jnp.array([[1.0 - k1, zero], [k2, one]])
+    star = propagation(period) @ jnp.stack([k1, -k2])
+    noise = noise_covariance(2.0 * gyro, rate_noise) + noise_covariance(walk, bias_walk)
+    steps = jax.vmap(propagation)(period * jnp.arange(every).astype(float))
+    increments = jax.vmap(lambda step: step @ noise @ step.T)(steps)
+    accumulated = jnp.cumsum(increments, axis=0) - increments  # covariance accumulated since the star tracker sample
+    cycle_matrix = corrected @ steps[-1]
+    noise = corrected @ accumulated[-1] @ corrected.T + noise_covariance(star, attitude_noise)
+    noise = noise + noise_covariance(corrected @ gyro + gyro, rate_noise) + noise_covariance(walk, bias_walk)
+    first_covariance = matrices.solve(jnp.eye(4) - jnp.kron(cycle_matrix, cycle_matrix), noise.reshape(4)).reshape(2, 2)
 
-    def spread(step: Array, since: Array) -> Array:
-        return cholesky(step @ first @ step.T + since + square(gyro, rate_noise))
+    def covariance_factor(step: Array, accumulated_here: Array) -> Array:
+        return cholesky(step @ first_covariance @ step.T + accumulated_here + noise_covariance(gyro, rate_noise))
 
-    return AttitudeFilter(k1, k2, jax.vmap(spread)(steps, added))
+    return AttitudeFilter(k1, k2, jax.vmap(covariance_factor)(steps, accumulated))
 
 
 def cholesky(covariance: Float[Array, "2 2"]) -> Float[Array, "2 2"]:
@@ -187,5 +187,5 @@ def cholesky(covariance: Float[Array, "2 2"]) -> Float[Array, "2 2"]:
     """
     (a, b), (_, d) = covariance
     first = guards.sqrt(jnp.maximum(a, 0.0))
-    along = jnp.where(first > 0.0, b / jnp.where(first > 0.0, first, 1.0), 0.0)
-    return jnp.array([[first, 0.0], [along, guards.sqrt(jnp.maximum(d - along * along, 0.0))]])
+    off_diagonal = jnp.where(first > 0.0, b / jnp.where(first > 0.0, first, 1.0), 0.0)
+    return jnp.array([[first, 0.0], [off_diagonal, guards.sqrt(jnp.maximum(d - off_diagonal * off_diagonal, 0.0))]])

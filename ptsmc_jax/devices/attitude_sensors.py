@@ -16,7 +16,7 @@ from ptsmc_jax.devices.star_times import pattern
 from ptsmc_jax.numerics import attitude, guards
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 
-TOLERANCE = 1e-9  # relative: a number of periods this close to a whole one is whole
+INTEGER_TOLERANCE = 1e-9  # relative
 
 
 @pytree
@@ -38,39 +38,41 @@ class SampleTimes:
     pattern: tuple[int, int] = field(metadata={"static": True})  # see `star_times.pattern`
 
     @property
-    def queue(self) -> int:
+    def longest_wait(self) -> int:
         """Return the largest number of control samples that a reading waits for."""
         return self.wait + self.split
 
     @property
-    def past(self) -> int:
+    def past_samples(self) -> int:
         """Return how many past control samples the filter needs to know the attitude at a reading."""
-        return self.queue + (self.every is None)
+        return self.longest_wait + (self.every is None)
 
-    def taken(self, sample: Any) -> Any:
+    def is_reading_new(self, sample: Any) -> Any:
         """Return whether a reading was taken since the control sample before this one."""
         if self.every is not None:
             return sample % self.every == 0
-        return self._count(sample) > self._count(sample - 1)
+        return self._newest_reading(sample) > self._newest_reading(sample - 1)
 
-    def taken_ago(self, sample: Any, dt: Scalar) -> Any:
+    def newest_reading_age(self, sample: Any, dt: Scalar) -> Any:
         """Return the time since the newest reading [s], at most the length dt [s] of the period before the sample."""
-        age = self._time(sample) - self._count(sample) * self.interval
+        age = self._time(sample) - self._newest_reading(sample) * self.interval
         return jnp.minimum(jnp.maximum(age, 0.0), dt)
 
-    def due(self, sample: Any) -> Any:
+    def is_reading_due(self, sample: Any) -> Any:
         """Return whether the flight software gets a reading at a control sample."""
         if self.every is not None:
             return (sample - self.wait) % self.every == 0
-        return self._count(sample, self.latency) > self._count(sample - 1, self.latency)
+        return self._newest_reading(sample, self.latency) > self._newest_reading(sample - 1, self.latency)
 
-    def age(self, sample: Any) -> Any:
+    def delivered_age(self, sample: Any) -> Any:
         """Return the age of the newest reading that the flight software has at a control sample [s]."""
         if self.every is not None:
             return self.wait * self.period
-        return jnp.maximum(self._time(sample) - self._count(sample, self.latency) * self.interval, self.latency)
+        return jnp.maximum(
+            self._time(sample) - self._newest_reading(sample, self.latency) * self.interval, self.latency
+        )
 
-    def place(self, age: Any) -> tuple[Any, Any]:
+    def split_age(self, age: Any) -> tuple[Any, Any]:
         """Return the age of a reading [s] as a number of whole control periods and the remaining time [s].
 
         The number of periods is an int if it is the same for all readings.
@@ -82,11 +84,11 @@ class SampleTimes:
             whole = jnp.where(age >= (self.wait + 1) * self.period - self._rounding, self.wait + 1, self.wait)
         return whole, jnp.clip(age - whole * self.period, 0.0, self.period)
 
-    def in_step(self) -> "SampleTimes":
+    def at_control_samples(self) -> "SampleTimes":
         """Return times at which a reading is taken at every control sample, for a sensor with its own clock."""
         if self.every is not None:
             return self
-        return replace(self, interval=self.period, every=1, wait=self.queue, split=False, pattern=(1, 1))
+        return replace(self, interval=self.period, every=1, wait=self.longest_wait, split=False, pattern=(1, 1))
 
     @property
     def _rounding(self) -> Any:
@@ -95,7 +97,7 @@ class SampleTimes:
     def _time(self, sample: Any) -> Any:
         return jnp.asarray(sample, float) * self.period
 
-    def _count(self, sample: Any, latency: Any = 0.0) -> Any:
+    def _newest_reading(self, sample: Any, latency: Any = 0.0) -> Any:
         """Return the number of the newest reading that is at least a latency [s] old at a control sample."""
         t = self._time(sample)
         return jnp.floor((t - latency + guards.time_tolerance(self.period, t)) / self.interval)
@@ -109,12 +111,12 @@ def sample_times(interval: float, latency: float, period: float) -> SampleTimes:
         latency: time from a reading until the flight software receives it [s].
         period: control period [s].
     """
-    ratio, late = interval / period, latency / period
-    every = round(ratio) if abs(ratio - round(ratio)) < TOLERANCE * ratio else None
-    whole = abs(late - round(late)) < TOLERANCE * max(late, 1.0)
-    wait = round(late) if whole else math.ceil(late) if every is not None else math.floor(late)
-    apart, age, control = (jnp.asarray(float(v)) for v in (interval, latency, period))
-    return SampleTimes(apart, age, control, every, wait, every is None and not whole, pattern(ratio))
+    ratio, delay = interval / period, latency / period
+    every = round(ratio) if abs(ratio - round(ratio)) < INTEGER_TOLERANCE * ratio else None
+    is_whole = abs(delay - round(delay)) < INTEGER_TOLERANCE * max(delay, 1.0)
+    wait = round(delay) if is_whole else math.ceil(delay) if every is not None else math.floor(delay)
+    interval_s, latency_s, period_s = (jnp.asarray(float(v)) for v in (interval, latency, period))
+    return SampleTimes(interval_s, latency_s, period_s, every, wait, every is None and not is_whole, pattern(ratio))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,16 +148,16 @@ class AttitudeSensor:
     def sensitivity(self, q: Float[Array, "4"]) -> Float[Array, "m 3"]:
         """Return the derivative (m, 3) of a reading by a small rotation [rad] about the body axes at attitude q."""
 
-        def turned(turn: Array) -> Array:
+        def change_by_rotation(turn: Array) -> Array:
             return self.change(self.read(q), self.read(attitude.multiply(q, attitude.from_rotation_vector(turn))))
 
-        return jax.jacfwd(turned)(jnp.zeros(3))
+        return jax.jacfwd(change_by_rotation)(jnp.zeros(3))
 
     def axes(self) -> Float[Array, "3 3"]:
         """Return the sensor's axes in body axes, one per row (3, 3)."""
         return jax.vmap(lambda axis: attitude.rotate(self.mounting, axis))(jnp.eye(3))
 
-    def in_step(self) -> "AttitudeSensor":
+    def at_control_samples(self) -> "AttitudeSensor":
         """Return a sensor that reads at every control sample, with noise that gives the same information per time.
 
         A sensor without its own clock is returned unchanged.
@@ -163,7 +165,7 @@ class AttitudeSensor:
         if self.times.every is not None:
             return self
         fraction = self.times.period / self.times.interval
-        return replace(self, noise=self.noise / jnp.sqrt(fraction), times=self.times.in_step())
+        return replace(self, noise=self.noise / jnp.sqrt(fraction), times=self.times.at_control_samples())
 
 
 @pytree

@@ -31,7 +31,7 @@ class CommandFilter(declare.Tunable):
         1.0,
         "corner",
         unit="rad/s",
-        meaning="W, its corner frequency, which tuning may move as command_corner",
+        meaning="W, corner frequency (gain command_corner)",
         free=True,
     )
 
@@ -47,13 +47,13 @@ class CommandFilter(declare.Tunable):
         """Return g = tan(W dt / 2) [-] for a period dt [s]; W dt must be below pi."""
         return jnp.tan(0.5 * self.corner * dt)
 
-    def step(self, state: Any, u: Vector, before: Scalar, dt: Scalar) -> tuple[Vector, Any]:
+    def step(self, state: Any, u: Vector, dt_before: Scalar, dt: Scalar) -> tuple[Vector, Any]:
         """Return the filtered command (m,) [N m] of a sample, and the state for the next sample.
 
         Args:
             state: from `begin` or from the last sample.
             u: command of the law (m,) [N m].
-            before: length of the period that ends at the sample [s].
+            dt_before: length of the period that ends at the sample [s].
             dt: length of the period that begins at the sample [s].
         """
         raise NotImplementedError
@@ -64,7 +64,7 @@ class CommandFilter(declare.Tunable):
 class FirstOrder(CommandFilter):
     """Roll-off of first order, W / (s + W).
 
-    3 dB and 45 degrees at the corner, then 20 dB a decade.
+    It attenuates by 3 dB at its corner, with a phase lag of 45 degrees, and by 20 dB per decade above.
     """
 
     def dead_time(self) -> Scalar | float:
@@ -75,18 +75,18 @@ class FirstOrder(CommandFilter):
         """Return the integrator (m,) [N m] at rest. Between samples it is advanced by half of the next period."""
         return jnp.zeros(inputs)
 
-    def step(self, state: Vector, u: Vector, before: Scalar, dt: Scalar) -> tuple[Vector, Vector]:
+    def step(self, state: Vector, u: Vector, dt_before: Scalar, dt: Scalar) -> tuple[Vector, Vector]:
         """Return the low-pass output y of y' = W (u - y), and the next state."""
-        g = self.prewarped(before)
+        g = self.prewarped(dt_before)
         y = (state + g * u) / (1.0 + g)
         return y, y + self.prewarped(dt) * (u - y)
 
 
 @dataclass(frozen=True)
-class _Second(CommandFilter):
+class _SecondOrderFilter(CommandFilter):
     """State-variable filter with two integrators: b' = W h, l' = W b, h = u - 2 z b - l."""
 
-    damping: Leaf = declare.number(0.7, above=0.0, meaning="z, its damping ratio")
+    damping: Leaf = declare.number(0.7, above=0.0, meaning="z, damping ratio")
 
     def dead_time(self) -> Scalar | float:
         """Return 2 z / W [s]."""
@@ -96,11 +96,11 @@ class _Second(CommandFilter):
         """Return the state at rest."""
         return FilterState(jnp.zeros(inputs), jnp.zeros(inputs))
 
-    def _integrated(
-        self, state: FilterState, u: Vector, before: Scalar, dt: Scalar
+    def _advance(
+        self, state: FilterState, u: Vector, dt_before: Scalar, dt: Scalar
     ) -> tuple[Vector, Vector, FilterState]:
         """Return the band-pass output b, the low-pass output l and the next state."""
-        g, next_g = self.prewarped(before), self.prewarped(dt)
+        g, next_g = self.prewarped(dt_before), self.prewarped(dt)
         band = (state.first + g * (u - state.second)) / (1.0 + g * (g + 2.0 * self.damping))
         low = state.second + g * band
         high = u - 2.0 * self.damping * band - low
@@ -109,29 +109,29 @@ class _Second(CommandFilter):
 
 @pytree
 @dataclass(frozen=True)
-class SecondOrder(_Second):
+class SecondOrder(_SecondOrderFilter):
     """Roll-off of second order, W^2 / (s^2 + 2 z W s + W^2).
 
-    90 degrees at the corner, then 40 dB a decade.
+    Its phase lag is 90 degrees at its corner. Above, it attenuates by 40 dB per decade.
     """
 
-    def step(self, state: FilterState, u: Vector, before: Scalar, dt: Scalar) -> tuple[Vector, FilterState]:
+    def step(self, state: FilterState, u: Vector, dt_before: Scalar, dt: Scalar) -> tuple[Vector, FilterState]:
         """Return the low-pass output and the next state."""
-        _, low, state = self._integrated(state, u, before, dt)
+        _, low, state = self._advance(state, u, dt_before, dt)
         return low, state
 
 
 @pytree
 @dataclass(frozen=True)
-class Notch(_Second):
+class Notch(_SecondOrderFilter):
     """Notch, (s^2 + W^2) / (s^2 + 2 z W s + W^2).
 
-    Nothing passes at its corner, and its width grows with z.
+    The gain at its corner is zero, and its width increases with z.
     """
 
-    damping: Leaf = declare.number(0.5, above=0.0, meaning="z, how wide it is")
+    damping: Leaf = declare.number(0.5, above=0.0, meaning="z, which increases the width of the notch")
 
-    def step(self, state: FilterState, u: Vector, before: Scalar, dt: Scalar) -> tuple[Vector, FilterState]:
+    def step(self, state: FilterState, u: Vector, dt_before: Scalar, dt: Scalar) -> tuple[Vector, FilterState]:
         """Return u - 2 z b, the command minus the band-pass output, and the next state."""
-        band, _, state = self._integrated(state, u, before, dt)
+        band, _, state = self._advance(state, u, dt_before, dt)
         return u - 2.0 * self.damping * band, state

@@ -75,6 +75,6 @@ class CustomSensors(Sensor):
         measured, new = self.custom.see(sensor_memory, x, guards.lerp(now.noise_weight, noise, noise_next), now.t, dt)
         return measured, (key, noise_next, guards.select(now.t_next > now.t, new, sensor_memory))
 
-    def quiet(self) -> "CustomSensors":
+    def without_noise(self) -> "CustomSensors":
         """Return the sensors with all standard normal numbers set to zero."""
         return replace(self, noise_scale=0.0 * self.noise_scale)

@@ -34,9 +34,11 @@ from ptsmc_jax.devices.attitude_sensors import AttitudeSensor
 from ptsmc_jax.numerics import attitude, guards
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 
-LONGEST = 1000  # Largest number of control periods of a cycle; `first` has only this many of a longer cycle.
-DOUBLINGS = 60  # Largest number of times that the number of cycles is doubled until the steady state.
-SWITCHED_ON = 0.1  # 1 sigma of the initial attitude [rad], as the body may turn in the first reading's latency.
+# largest number of control periods of a cycle; of a longer cycle `KalmanFilter.first` has only this many
+LONGEST_CYCLE = 1000
+DOUBLINGS = 60  # largest number of doublings of the number of cycles until the steady state
+# 1 sigma of the attitude at switch-on [rad], because the body may turn before the first reading arrives
+SWITCH_ON_SIGMA = 0.1
 TURN, BIAS, NOISE = slice(0, 3), slice(3, 6), slice(6, 9)
 
 
@@ -73,12 +75,12 @@ class KalmanFilter:
     first: Leaf
 
     @property
-    def past(self) -> int:
+    def past_samples(self) -> int:
         """Return the number of past control samples that the filter keeps."""
-        return max((sensor.times.past for sensor in self.sensors), default=0)
+        return max((sensor.times.past_samples for sensor in self.sensors), default=0)
 
     @property
-    def between(self) -> bool:
+    def has_readings_between_samples(self) -> bool:
         """Return whether a sensor reads between control samples."""
         return any(sensor.times.every is None for sensor in self.sensors)
 
@@ -101,27 +103,27 @@ class KalmanFilter:
             sample: number of the first control sample; the state is the one just before it.
             weight: weight of this sample, below 1 in a partial first period.
         """
-        factor, past = self.first_factor(sample, weight), self.past
+        factor, past = self.first_factor(sample, weight), self.past_samples
         error = factor @ normals
         q = attitude.multiply(q, attitude.from_rotation_vector(error[TURN]))
         bias = bias + error[BIAS]
         past_q = jnp.tile(q, (past, 1)) if past else None
-        past_w = jnp.tile(w, (past, 1)) if self.between else None
+        past_w = jnp.tile(w, (past, 1)) if self.has_readings_between_samples else None
         return Track(q, bias, w + bias, past_q, past_w, self.covariance(factor))
 
     def covariance(self, factor: Float[Array, "6 6"]) -> Float[Array, "n n"]:
         """Return the covariance (n, n) of all errors from a factor (6, 6) of the covariance of (a, b)."""
-        more = 3 + 3 * self.past
-        return jnp.pad(factor @ factor.T, ((0, more), (0, more)))
+        other_errors = 3 + 3 * self.past_samples
+        return jnp.pad(factor @ factor.T, ((0, other_errors), (0, other_errors)))
 
-    def unknown(self) -> Float[Array, "n n"]:
+    def covariance_at_switch_on(self) -> Float[Array, "n n"]:
         """Return the covariance (n, n) of all errors before the first reading, assuming that the body hardly turned."""
         covariance = self.covariance(self.first[0])
-        attitudes = np.r_[0:3, 9 : 9 + 3 * self.past]
-        same = np.zeros(covariance.shape)
-        same[np.ix_(attitudes, attitudes)] = SWITCHED_ON**2 * np.tile(np.eye(3), (1 + self.past,) * 2)
-        bias = jnp.pad(self.rate_bias**2, (3, 3 + 3 * self.past))
-        return covariance + jnp.asarray(same) + jnp.diag(bias)
+        attitudes = np.r_[0:3, 9 : 9 + 3 * self.past_samples]
+        prior = np.zeros(covariance.shape)
+        prior[np.ix_(attitudes, attitudes)] = SWITCH_ON_SIGMA**2 * np.tile(np.eye(3), (1 + self.past_samples,) * 2)
+        bias = jnp.pad(self.rate_bias**2, (3, 3 + 3 * self.past_samples))
+        return covariance + jnp.asarray(prior) + jnp.diag(bias)
 
     def propagate(self, old: Track, gyro: Float[Array, "3"], dt: Scalar) -> Track:
         """Return the state a control period later.
@@ -137,10 +139,10 @@ class KalmanFilter:
             past_q = jnp.concatenate([old.q[None], past_q[:-1]])
         if past_w is not None:
             past_w = jnp.concatenate([old.w[None], past_w[:-1]])
-        covariance = self._propagated(old.covariance, turn, dt)
+        covariance = self._propagate_covariance(old.covariance, turn, dt)
         return Track(attitude.multiply(old.q, turn), old.bias, gyro, past_q, past_w, covariance)
 
-    def _propagated(self, p: Array, turn: Array, dt: Scalar) -> Array:
+    def _propagate_covariance(self, p: Array, turn: Array, dt: Scalar) -> Array:
         """Return the covariance a control period later.
 
         Args:
@@ -149,27 +151,28 @@ class KalmanFilter:
             dt: length of the period [s].
         """
         half, zero = dt / 2, jnp.zeros((3, 3))
-        back = jax.vmap(partial(attitude.rotate, turn))(jnp.eye(3))  # R'
-        fresh, drift = jnp.diag(self.rate_noise**2), jnp.diag((self.drift * dt) ** 2)
+        inverse_rotation = jax.vmap(partial(attitude.rotate, turn))(jnp.eye(3))  # R'
+        gyro_noise, drift = jnp.diag(self.rate_noise**2), jnp.diag((self.drift * dt) ** 2)
 
-        def moved(rows: Array) -> Array:
+        def propagate_attitude_rows(rows: Array) -> Array:
             """Return the rows of a+, without new noise, from the rows of all errors."""
-            return back @ (rows[TURN] - half * (rows[BIAS] + rows[NOISE])) - half * rows[BIAS]
+            return inverse_rotation @ (rows[TURN] - half * (rows[BIAS] + rows[NOISE])) - half * rows[BIAS]
 
-        by_old = moved(p)  # covariance of a+ and the old errors
-        turn_turn = moved(by_old.T) + half**2 * (fresh + drift)
-        turn_bias, turn_noise = by_old[:, BIAS] - half * drift, -half * fresh
+        attitude_by_old = propagate_attitude_rows(p)  # covariance of a+ and the old errors
+        turn_turn = propagate_attitude_rows(attitude_by_old.T) + half**2 * (gyro_noise + drift)
+        turn_bias, turn_noise = attitude_by_old[:, BIAS] - half * drift, -half * gyro_noise
         rows = [
             [turn_turn, turn_bias, turn_noise],
             [turn_bias.T, p[BIAS, BIAS] + drift, zero],
-            [turn_noise, zero, fresh],
+            [turn_noise, zero, gyro_noise],
         ]
-        if not self.past:
+        if not self.past_samples:
             return jnp.block(rows)
-        kept = np.r_[0:3, 9 : 6 + 3 * self.past]  # the current attitude error becomes a past one, the oldest is dropped
-        by_past = [by_old[:, kept], p[BIAS, kept], jnp.zeros((3, len(kept)))]
-        rows = [[*row, last] for row, last in zip(rows, by_past, strict=True)]
-        return jnp.block([*rows, [*(last.T for last in by_past), p[kept][:, kept]]])
+        # the current attitude error becomes a past one, and the oldest past one is dropped
+        kept_places = np.r_[0:3, 9 : 6 + 3 * self.past_samples]
+        past_columns = [attitude_by_old[:, kept_places], p[BIAS, kept_places], jnp.zeros((3, len(kept_places)))]
+        rows = [[*row, column] for row, column in zip(rows, past_columns, strict=True)]
+        return jnp.block([*rows, [*(column.T for column in past_columns), p[kept_places][:, kept_places]]])
 
     def correct(self, old: Track, k: int, reading: Array, age: Scalar, weight: Scalar) -> Track:
         """Return the state after a reading.
@@ -182,21 +185,21 @@ class KalmanFilter:
             weight: 1 for a reading, 0 for none. A weight between 0 and 1 multiplies the noise by 1/sqrt(weight).
         """
         sensor = self.sensors[k]
-        q, picked, fraction = self._when_taken(old, sensor, age)
+        q, rows_at_reading, fraction = self._estimate_at_reading(old, sensor, age)
         rows, residual = sensor.sensitivity(q), sensor.change(sensor.read(q), reading)
         # between control samples the errors are interpolated linearly; this is the variance of the remaining gyro noise
-        lost = (self.period * fraction * (1.0 - fraction)) ** 2 / 2 if sensor.times.every is None else 0.0
-        p, change = old.covariance, jnp.zeros(len(old.covariance))
+        gyro_factor = (self.period * fraction * (1.0 - fraction)) ** 2 / 2 if sensor.times.every is None else 0.0
+        p, correction = old.covariance, jnp.zeros(len(old.covariance))
         for row, difference, noise in zip(rows, residual, sensor.noise, strict=True):
-            by_all = row @ picked(p)
-            variance = noise**2 + lost * jnp.sum((row * self.rate_noise) ** 2)
-            gain = weight / (weight * (row @ picked(by_all)) + variance)
-            change = change + gain * (difference - row @ picked(change)) * by_all
+            by_all = row @ rows_at_reading(p)
+            variance = noise**2 + gyro_factor * jnp.sum((row * self.rate_noise) ** 2)
+            gain = weight / (weight * (row @ rows_at_reading(by_all)) + variance)
+            correction = correction + gain * (difference - row @ rows_at_reading(correction)) * by_all
             p = p - gain * jnp.outer(by_all, by_all)
-        return self.retract(old, change)._replace(covariance=p)
+        return self.retract(old, correction)._replace(covariance=p)
 
-    def _when_taken(self, old: Track, sensor: AttitudeSensor, age: Scalar) -> tuple[Array, Any, Scalar]:
-        """Return the estimated attitude when a reading was taken, a function for its error, and a fraction.
+    def _estimate_at_reading(self, old: Track, sensor: AttitudeSensor, age: Scalar) -> tuple[Array, Any, Scalar]:
+        """Return the estimated attitude at the time of a reading, a function for its error, and a fraction.
 
         Args:
             old: state at this control sample.
@@ -207,44 +210,44 @@ class KalmanFilter:
             The attitude (4,); a function that extracts the rows of its error (3, ..) from an array (errors, ..); the
             fraction of a control period between the reading and the control sample after it.
         """
-        whole, rest = sensor.times.place(age)
+        periods, rest = sensor.times.split_age(age)
         fraction = rest / self.period
 
-        def at(values: Array, more: int = 0) -> Array:
-            """Return the entry `whole` + `more` control samples back; entry 0 is the current one."""
-            if isinstance(whole, int):
-                return values[whole + more]
-            low = sensor.times.wait + more
-            return jnp.where(whole == sensor.times.wait, values[low], values[low + 1])
+        def entry_back(values: Array, further: int = 0) -> Array:
+            """Return the entry `periods` + `further` control samples back; entry 0 is the current one."""
+            if isinstance(periods, int):
+                return values[periods + further]
+            index = sensor.times.wait + further
+            return jnp.where(periods == sensor.times.wait, values[index], values[index + 1])
 
-        def picked(values: Array) -> Array:
-            blocks = jnp.concatenate([values[TURN], values[9:]]).reshape(self.past + 1, 3, *values.shape[1:])
-            here = at(blocks)
-            return here if sensor.times.every is not None else here + fraction * (at(blocks, 1) - here)
+        def rows_at_reading(values: Array) -> Array:
+            blocks = jnp.concatenate([values[TURN], values[9:]]).reshape(self.past_samples + 1, 3, *values.shape[1:])
+            rows = entry_back(blocks)
+            return rows if sensor.times.every is not None else rows + fraction * (entry_back(blocks, 1) - rows)
 
-        q = old.q if self.past == 0 else at(jnp.concatenate([old.q[None], old.past_q]))
+        q = old.q if self.past_samples == 0 else entry_back(jnp.concatenate([old.q[None], old.past_q]))
         if sensor.times.every is None:
             rates = jnp.concatenate([old.w[None], old.past_w])
-            here, before = at(rates), at(rates, 1)
-            turn = rest * here - rest * fraction / 2 * (here - before)
+            w, w_before = entry_back(rates), entry_back(rates, 1)
+            turn = rest * w - rest * fraction / 2 * (w - w_before)
             q = attitude.multiply(q, attitude.from_rotation_vector(-turn))
-        return q, picked, fraction
+        return q, rows_at_reading, fraction
 
     def retract(self, track: Track, by: Float[Array, " n"]) -> Track:
         """Return the state with its estimate changed by local coordinates (9 + 3 past,), the errors of the filter."""
 
-        def turned(q: Array, turn: Array) -> Array:
+        def rotated(q: Array, turn: Array) -> Array:
             return attitude.normalise(attitude.multiply(q, attitude.from_rotation_vector(turn)))
 
         past_q = track.past_q
         if past_q is not None:
-            past_q = jax.vmap(turned)(past_q, by[9:].reshape(-1, 3))
-        q, bias, rate = turned(track.q, by[TURN]), track.bias + by[BIAS], track.rate - by[NOISE]
+            past_q = jax.vmap(rotated)(past_q, by[9:].reshape(-1, 3))
+        q, bias, rate = rotated(track.q, by[TURN]), track.bias + by[BIAS], track.rate - by[NOISE]
         return track._replace(q=q, bias=bias, rate=rate, past_q=past_q)
 
-    def in_step(self) -> "KalmanFilter":
+    def at_control_samples(self) -> "KalmanFilter":
         """Return the filter for sensors that all read at control samples, for linear theory."""
-        return replace(self, sensors=tuple(sensor.in_step() for sensor in self.sensors))
+        return replace(self, sensors=tuple(sensor.at_control_samples() for sensor in self.sensors))
 
     def local_coordinates(self, track: Track, other: Track) -> Float[Array, " n"]:
         """Return local coordinates (9 + 3 past,) [rad, rad/s] of a state near another one, to first order."""
@@ -274,11 +277,11 @@ def kalman_filter(
         raise ValueError("every attitude sensor must have noise greater than 0")
     each = (rate_noise, drift, rate_bias)
     gyro, change, bias = (jnp.broadcast_to(jnp.asarray(v, float), (3,)) for v in each)
-    found = KalmanFilter(tuple(sensors), gyro, change, bias, jnp.asarray(float(period)), jnp.zeros((1, 6, 6)))
-    return replace(found, first=jnp.asarray(_steady_state(found)))
+    kalman = KalmanFilter(tuple(sensors), gyro, change, bias, jnp.asarray(float(period)), jnp.zeros((1, 6, 6)))
+    return replace(kalman, first=jnp.asarray(_steady_state(kalman)))
 
 
-class _Element(NamedTuple):
+class _CovarianceMap(NamedTuple):
     """Map of a covariance p over several filter steps, a p (1 + c p)^-1 a' + b.
 
     Source: Särkkä and García-Fernández, IEEE Trans. Automatic Control 66(1), 2021.
@@ -288,77 +291,81 @@ class _Element(NamedTuple):
     b: np.ndarray
     c: np.ndarray
 
-    def then(self, other: "_Element") -> "_Element":
+    def followed_by(self, other: "_CovarianceMap") -> "_CovarianceMap":
         """Return the map of these steps followed by other steps."""
         left = other.a @ np.linalg.inv(np.eye(len(self.a)) + self.b @ other.c)
         right = self.a.T @ np.linalg.inv(np.eye(len(self.a)) + other.c @ self.b)
-        return _Element(left @ self.a, left @ self.b @ other.a.T + other.b, right @ other.c @ self.a + self.c)
+        return _CovarianceMap(left @ self.a, left @ self.b @ other.a.T + other.b, right @ other.c @ self.a + self.c)
 
 
-def _steady_state(found: KalmanFilter) -> np.ndarray:
+def _steady_state(kalman: KalmanFilter) -> np.ndarray:
     """Return factors (cycle, 6, 6) of the covariance of (a, b) just before each control sample of a cycle, at rest.
 
     The function doubles the number of cycles until the covariance converges (Anderson and Moore, Optimal Filtering,
     1979, section 6.7).
     """
-    count = min(math.lcm(*(sensor.times.pattern[0] for sensor in found.sensors)), LONGEST)
-    size, one = 9 + 3 * found.past, np.eye(9 + 3 * found.past)
-    grown = np.asarray(_grown(found))
-    half = float(found.period) / 2
-    move = np.zeros((size, size))
-    move[TURN, :9] = np.hstack([np.eye(3), -2 * half * np.eye(3), -half * np.eye(3)])
-    move[BIAS, BIAS] = np.eye(3)
-    if found.past:
-        move[9:12, TURN] = np.eye(3)
-        move[12:, 9:-3] = np.eye(size - 12)
-    predicted = _Element(move, grown, np.zeros((size, size)))
-    corrected = _corrections(found, count)
-    cycle = _Element(one, np.zeros((size, size)), np.zeros((size, size)))
-    for updates in corrected:
-        cycle = cycle.then(predicted)
-        for rows in updates:
-            cycle = cycle.then(_Element(one, np.zeros((size, size)), rows))
+    count = min(math.lcm(*(sensor.times.pattern[0] for sensor in kalman.sensors)), LONGEST_CYCLE)
+    size, identity = 9 + 3 * kalman.past_samples, np.eye(9 + 3 * kalman.past_samples)
+    noise = np.asarray(_noise_of_period(kalman))
+    half = float(kalman.period) / 2
+    transition = np.zeros((size, size))
+    transition[TURN, :9] = np.hstack([np.eye(3), -2 * half * np.eye(3), -half * np.eye(3)])
+    transition[BIAS, BIAS] = np.eye(3)
+    if kalman.past_samples:
+        transition[9:12, TURN] = np.eye(3)
+        transition[12:, 9:-3] = np.eye(size - 12)
+    prediction = _CovarianceMap(transition, noise, np.zeros((size, size)))
+    information = _information_per_sample(kalman, count)
+    cycle = _CovarianceMap(identity, np.zeros((size, size)), np.zeros((size, size)))
+    for readings in information:
+        cycle = cycle.followed_by(prediction)
+        for rows in readings:
+            cycle = cycle.followed_by(_CovarianceMap(identity, np.zeros((size, size)), rows))
     for _ in range(DOUBLINGS):
-        cycle, before = cycle.then(cycle), cycle
-        if np.allclose(cycle.b, before.b, rtol=1e-12, atol=0.0):
+        cycle, previous = cycle.followed_by(cycle), cycle
+        if np.allclose(cycle.b, previous.b, rtol=1e-12, atol=0.0):
             break
-    p, factors = cycle.b, np.zeros((count, 6, 6))
-    for number, updates in enumerate(corrected, start=1):
-        p = move @ p @ move.T + grown
-        factors[number % count] = _factor(p[:6, :6])
-        for rows in updates:
-            p = p @ np.linalg.inv(one + rows @ p)
+    covariance, factors = cycle.b, np.zeros((count, 6, 6))
+    for number, readings in enumerate(information, start=1):
+        covariance = transition @ covariance @ transition.T + noise
+        factors[number % count] = _square_root(covariance[:6, :6])
+        for rows in readings:
+            covariance = covariance @ np.linalg.inv(identity + rows @ covariance)
     return factors
 
 
 @programs.jit  # one compiled program for all filters with sensors of the same kinds and sample times
-def _grown(found: KalmanFilter) -> Array:
+def _noise_of_period(kalman: KalmanFilter) -> Array:
     """Return the covariance (errors, errors) that a control period at rest adds."""
-    size = 9 + 3 * found.past
-    return found._propagated(jnp.zeros((size, size)), jnp.array([0.0, 0.0, 0.0, 1.0]), found.period)
+    size = 9 + 3 * kalman.past_samples
+    return kalman._propagate_covariance(jnp.zeros((size, size)), jnp.array([0.0, 0.0, 0.0, 1.0]), kalman.period)
 
 
-def _corrections(found: KalmanFilter, count: int) -> list[list[np.ndarray]]:
+def _information_per_sample(kalman: KalmanFilter, count: int) -> list[list[np.ndarray]]:
     """Return the information (errors, errors) of the readings due at each control sample 1 .. count, at rest."""
-    numbers, size = jnp.arange(1, count + 1), 9 + 3 * found.past
-    places = [TURN, *(slice(k, k + 3) for k in range(9, size, 3))]
-    corrected: list[list[np.ndarray]] = [[] for _ in range(count)]
-    for sensor in found.sensors:
+    samples, size = jnp.arange(1, count + 1), 9 + 3 * kalman.past_samples
+    attitude_slices = [TURN, *(slice(k, k + 3) for k in range(9, size, 3))]
+    information: list[list[np.ndarray]] = [[] for _ in range(count)]
+    for sensor in kalman.sensors:
         axes = np.asarray(sensor.sensitivity(jnp.array([0.0, 0.0, 0.0, 1.0])))
-        whole, rest = sensor.times.place(sensor.times.age(numbers))
-        whole, fractions = (np.broadcast_to(v, count) for v in (whole, np.asarray(rest) / np.asarray(found.period)))
-        for k in np.flatnonzero(sensor.times.due(numbers)):
+        periods, rest = sensor.times.split_age(sensor.times.delivered_age(samples))
+        periods, fractions = (
+            np.broadcast_to(v, count) for v in (periods, np.asarray(rest) / np.asarray(kalman.period))
+        )
+        for k in np.flatnonzero(sensor.times.is_reading_due(samples)):
             fraction, rows = float(fractions[k]), np.zeros((len(sensor.noise), size))
-            rows[:, places[whole[k]]] = (1.0 - fraction) * axes
+            rows[:, attitude_slices[periods[k]]] = (1.0 - fraction) * axes
             if fraction > 0.0:
-                rows[:, places[whole[k] + 1]] = fraction * axes
-            lost = (float(found.period) * fraction * (1.0 - fraction)) ** 2 / 2
-            variance = np.asarray(sensor.noise) ** 2 + lost * np.sum((axes * np.asarray(found.rate_noise)) ** 2, axis=1)
-            corrected[k].append(rows.T @ (rows / variance[:, None]))
-    return corrected
+                rows[:, attitude_slices[periods[k] + 1]] = fraction * axes
+            interpolation_variance = (float(kalman.period) * fraction * (1.0 - fraction)) ** 2 / 2
+            variance = np.asarray(sensor.noise) ** 2 + interpolation_variance * np.sum(
+                (axes * np.asarray(kalman.rate_noise)) ** 2, axis=1
+            )
+            information[k].append(rows.T @ (rows / variance[:, None]))
+    return information
 
 
-def _factor(covariance: np.ndarray) -> np.ndarray:
+def _square_root(covariance: np.ndarray) -> np.ndarray:
     """Return a square root (n, n) of a positive semidefinite covariance; eigenvalues below zero are rounding."""
     scale = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))

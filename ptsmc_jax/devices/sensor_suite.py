@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from ptsmc_jax.devices.attitude_sensors import AttitudeSensor, StarTracker
 from ptsmc_jax.devices.kalman_filter import KalmanFilter, Track
-from ptsmc_jax.devices.sensors import ATTITUDE_AND_BIAS, RATE_NOISE, Reading, SpacecraftSensors
+from ptsmc_jax.devices.sensors import ATTITUDE_AND_BIAS, RATE_NOISE, MeasurementModel, SpacecraftSensors
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.numerics import guards
 from ptsmc_jax.numerics.draws import WholeNumber
@@ -59,24 +59,26 @@ class SensorSuite(SpacecraftSensors):
     given_bias: Leaf | None = None  # (3,) gyro bias at the first sample, if it is not random [rad/s]
     rate_scale: Leaf | None = None  # (3,) ratio of gyro reading to true rate [-]
     outage: Leaf | None = None  # (2,) start and end of an outage of the first attitude sensor [s]
-    noise_free: bool = field(default=False, metadata={"static": True})  # whether no noise is generated, see `quiet`
+    noise_free: bool = field(
+        default=False, metadata={"static": True}
+    )  # whether no noise is generated, see `without_noise`
 
     @property
     def star_tracker(self) -> StarTracker | None:
         """Return the first star tracker, whose readings telemetry has; None if there is none."""
-        return next((one for one in self.sensors if isinstance(one, StarTracker)), None)
+        return next((sensor for sensor in self.sensors if isinstance(sensor, StarTracker)), None)
 
     @property
     def every(self) -> int:
         """Return the number of control periods after which the sample times repeat, for means in linear theory."""
         return int(np.lcm.reduce([sensor.times.every or 1 for sensor in self.sensors]))
 
-    def taken_ago(self, sample: Array, dt: Scalar) -> Any:
+    def newest_reading_age(self, sample: Array, dt: Scalar) -> Any:
         """Return the age [s] of the newest reading of each sensor with its own clock, None for others; see `Sensor`."""
-        if not self.filter.between:
+        if not self.filter.has_readings_between_samples:
             return None
         clocks = (None if sensor.times.every is not None else sensor.times for sensor in self.sensors)
-        return tuple(None if times is None else times.taken_ago(sample, dt) for times in clocks)
+        return tuple(None if times is None else times.newest_reading_age(sample, dt) for times in clocks)
 
     @property
     def noises(self) -> list[tuple[str, Leaf, int]]:
@@ -92,7 +94,7 @@ class SensorSuite(SpacecraftSensors):
         estimate = self.filter.begin(x0.q, bias, x0.w, errors, now.sample, now.noise_weight)
         waiting = []
         for sensor in self.sensors:
-            count, reading = sensor.times.queue, sensor.read(x0.q)
+            count, reading = sensor.times.longest_wait, sensor.read(x0.q)
             waiting.append(Delivery(jnp.tile(reading, (count, 1)), jnp.zeros(count)) if count else None)
         return SuiteMemory(keys, self.noise(keys, now.sample), bias, tuple(waiting), estimate)
 
@@ -105,34 +107,34 @@ class SensorSuite(SpacecraftSensors):
         rate, bias = self.gyro_sample(memory, x.w, shift, now, dt)
         delivered, ages, waiting = [], [], []
         for k, (sensor, noise) in enumerate(zip(self.sensors, noises, strict=True)):
-            seen = x if star_x is None or star_x[k] is None else star_x[k]
-            weight = jnp.where(sensor.times.taken(now.sample), now.noise_weight, 0.0)
+            x_taken = x if star_x is None or star_x[k] is None else star_x[k]
+            weight = jnp.where(sensor.times.is_reading_new(now.sample), now.noise_weight, 0.0)
             if k == 0:
-                t = now.t if sensor.times.every is not None else now.t - sensor.times.taken_ago(now.sample, dt)
+                t = now.t if sensor.times.every is not None else now.t - sensor.times.newest_reading_age(now.sample, dt)
                 weight = self.outside_outage(weight, t)
-            age = jnp.asarray(sensor.times.age(now.sample), float)
-            new, queue = _passed(
-                Delivery(sensor.changed(sensor.read(seen.q), noise), weight), memory.waiting[k], sensor, now, age
+            age = jnp.asarray(sensor.times.delivered_age(now.sample), float)
+            received, queue = _delay_reading(
+                Delivery(sensor.changed(sensor.read(x_taken.q), noise), weight), memory.waiting[k], sensor, now, age
             )
-            delivered.append(new)
+            delivered.append(received)
             ages.append(age)
             waiting.append(queue)
-        found = Readings(tuple(delivered), tuple(ages), rate)
-        return found, memory._replace(noise=noise_next, bias=bias, waiting=tuple(waiting))
+        readings = Readings(tuple(delivered), tuple(ages), rate)
+        return readings, memory._replace(noise=noise_next, bias=bias, waiting=tuple(waiting))
 
     def inputs(
         self, memory: SuiteMemory, x: AttitudeState, now: Ticks, dt: Scalar, star_x: Any = None
     ) -> tuple[dict[str, Array], SuiteMemory]:
         """Return the inputs of exported C at a sample, by name, and the memory; see `Sensor.inputs`."""
-        found, memory = self.readings(memory, x, now, dt, star_x)
-        named: dict[str, Array] = {"rate": found.rate}
-        for sensor, (reading, weight), age in zip(self.sensors, found.delivered, found.ages, strict=True):
+        readings, memory = self.readings(memory, x, now, dt, star_x)
+        named: dict[str, Array] = {"rate": readings.rate}
+        for sensor, (reading, weight), age in zip(self.sensors, readings.delivered, readings.ages, strict=True):
             named[sensor.name] = reading
             named[f"{sensor.name}_valid"] = (weight > 0.0).astype(float)
             named[f"{sensor.name}_age"] = age
         return named, memory
 
-    def remembered(self, memory: SuiteMemory) -> dict[str, Array]:
+    def filter_state(self, memory: SuiteMemory) -> dict[str, Array]:
         """Return the state of the filter as exported C has it, by name."""
         track = memory.estimate
         named = {"attitude": track.q, "bias": track.bias, "gyro": track.rate, "covariance": track.covariance}
@@ -143,35 +145,35 @@ class SensorSuite(SpacecraftSensors):
         self, memory: SuiteMemory, x: AttitudeState, now: Ticks, dt: Scalar, star_x: Any = None
     ) -> tuple[AttitudeState, SuiteMemory]:
         """Return the attitude and rate that the filter estimates, and the memory."""
-        found, memory_next = self.readings(memory, x, now, dt, star_x)
-        estimate = self.filter.propagate(memory.estimate, found.rate, dt)
-        for k, ((reading, weight), age) in enumerate(zip(found.delivered, found.ages, strict=True)):
+        readings, memory_next = self.readings(memory, x, now, dt, star_x)
+        estimate = self.filter.propagate(memory.estimate, readings.rate, dt)
+        for k, ((reading, weight), age) in enumerate(zip(readings.delivered, readings.ages, strict=True)):
             estimate = self.filter.correct(estimate, k, reading, age, weight)
         return AttitudeState(estimate.q, estimate.w), memory_next._replace(estimate=estimate)
 
-    def quiet(self) -> "SensorSuite":
+    def without_noise(self) -> "SensorSuite":
         """Return the suite without noise and bias; the filter keeps its covariance."""
         return replace(self, noise_free=True, given_bias=None)
 
-    def in_step(self) -> "SensorSuite":
+    def at_control_samples(self) -> "SensorSuite":
         """Return a suite whose sensors all read at control samples, with the same information per time."""
-        sensors = tuple(sensor.in_step() for sensor in self.sensors)
-        return replace(self, sensors=sensors, filter=self.filter.in_step())
+        sensors = tuple(sensor.at_control_samples() for sensor in self.sensors)
+        return replace(self, sensors=sensors, filter=self.filter.at_control_samples())
 
-    def reading(self, sample: int = 0, fraction: float = 1.0) -> Reading:
+    def measurement_model(self, sample: int = 0, fraction: float = 1.0) -> MeasurementModel:
         """Return the readings of the attitude sensors and the gyro to first order, and the gyro bias.
 
         Args:
             sample: number of the first control sample.
             fraction: its weight, see `KalmanFilter.begin`.
         """
-        still = jnp.array([0.0, 0.0, 0.0, 1.0])
-        axes = [np.pad(sensor.sensitivity(still), ((0, 0), (0, 6))) for sensor in self.sensors]
+        identity = jnp.array([0.0, 0.0, 0.0, 1.0])
+        axes = [np.pad(sensor.sensitivity(identity), ((0, 0), (0, 6))) for sensor in self.sensors]
         rows = np.vstack([*axes, self.gyro_rows()])
         noise = np.concatenate([sigma for _, sigma, _ in self.noises])
-        early = self._each([sensor.times.every is None for sensor in self.sensors], False)
+        early = self._per_component([sensor.times.every is None for sensor in self.sensors], False)
         start = ATTITUDE_AND_BIAS, np.asarray(self.filter.first_factor(sample, fraction))
-        return Reading(rows, noise, np.asarray(self.rate_bias), np.asarray(self.bias_rate), start, early)
+        return MeasurementModel(rows, noise, np.asarray(self.rate_bias), np.asarray(self.bias_rate), start, early)
 
     def change(self, x: AttitudeState, near: AttitudeState, taken: Any = None, near_taken: Any = None) -> Array:
         """Return the differences of all readings (m,) between two true states.
@@ -179,39 +181,40 @@ class SensorSuite(SpacecraftSensors):
         Args:
             x: first true state at the control sample.
             near: second true state at the control sample.
-            taken: first true states at the times of `taken_ago`, or None if all readings are taken at the control
-                sample.
+            taken: first true states at the times of `newest_reading_age`; None: all readings are at the control sample.
             near_taken: second true states at these times, or None.
         """
         changes = []
         for k, sensor in enumerate(self.sensors):
-            here, there = (x, near) if taken is None or taken[k] is None else (taken[k], near_taken[k])
-            changes.append(sensor.change(sensor.read(here.q), sensor.read(there.q)))
+            state, near_state = (x, near) if taken is None or taken[k] is None else (taken[k], near_taken[k])
+            changes.append(sensor.change(sensor.read(state.q), sensor.read(near_state.q)))
         return jnp.concatenate([*changes, (near.w - x.w) * (1.0 if self.rate_scale is None else self.rate_scale)])
 
-    def lag(self, now: Ticks) -> np.ndarray:
+    def sample_delays(self, now: Ticks) -> np.ndarray:
         """Return how many control samples ago each reading was taken, (N, m).
 
         A reading between two control samples counts from the later one.
         """
-        whole = [np.broadcast_to(sensor.times.place(sensor.times.age(now.sample))[0], now.sample.shape)
+        delays = [np.broadcast_to(sensor.times.split_age(sensor.times.delivered_age(now.sample))[0], now.sample.shape)
                  for sensor in self.sensors]  # fmt: skip
-        return self._each(whole, np.zeros(now.sample.shape, int)).T
+        return self._per_component(delays, np.zeros(now.sample.shape, int)).T
 
     def available(self, now: Ticks) -> np.ndarray:
         """Return whether each reading is available at each control sample, (N, m) bool."""
-        there = []
+        availability = []
         for k, sensor in enumerate(self.sensors):
             times = sensor.times
-            fresh = np.asarray(now.sample) - np.asarray(times.place(times.age(now.sample))[0]) >= int(now.sample[0])
-            due = np.asarray(times.due(now.sample)) & fresh
+            fresh = np.asarray(now.sample) - np.asarray(times.split_age(times.delivered_age(now.sample))[0]) >= int(
+                now.sample[0]
+            )
+            due = np.asarray(times.is_reading_due(now.sample)) & fresh
             if k == 0 and self.outage is not None:
-                t, (begin, end) = np.asarray(now.t - times.age(now.sample)), np.asarray(self.outage)
+                t, (begin, end) = np.asarray(now.t - times.delivered_age(now.sample)), np.asarray(self.outage)
                 due &= ~((t >= begin) & (t < end))
-            there.append(due)
-        return self._each(there, np.ones(now.sample.shape, bool)).T
+            availability.append(due)
+        return self._per_component(availability, np.ones(now.sample.shape, bool)).T
 
-    def _each(self, values: list[Any], of_gyro: Any) -> np.ndarray:
+    def _per_component(self, values: list[Any], of_gyro: Any) -> np.ndarray:
         """Return values of the attitude sensors, and one of the gyro, repeated for each component (m, ..)."""
         sizes = [sensor.noise.shape[-1] for sensor in self.sensors]
         return np.repeat(np.stack([*values, of_gyro]), [*sizes, 3], axis=0)
@@ -219,12 +222,12 @@ class SensorSuite(SpacecraftSensors):
     @property
     def _queues(self) -> list[int]:
         """For each sensor, the number of local coordinates of its delayed readings."""
-        return [sensor.times.queue * sensor.noise.shape[-1] for sensor in self.sensors]
+        return [sensor.times.longest_wait * sensor.noise.shape[-1] for sensor in self.sensors]
 
     @property
-    def noise_place(self) -> slice:
+    def noise_slice(self) -> slice:
         """The place of the noise of the next sample in the coordinates of `retract`."""
-        first = 9 + 3 * self.filter.past + sum(self._queues)
+        first = 9 + 3 * self.filter.past_samples + sum(self._queues)
         return slice(first, first + sum(sensor.noise.shape[-1] for sensor in self.sensors) + 3)
 
     def retract(self, memory: SuiteMemory, by: Float[Array, " n"]) -> SuiteMemory:
@@ -234,32 +237,32 @@ class SensorSuite(SpacecraftSensors):
             memory: the memory at coordinates 0.
             by: coordinates (n,): filter [rad, rad/s], delayed readings, noise of the next sample.
         """
-        size = 9 + 3 * self.filter.past
-        own, *waiting, noise = jnp.split(by, np.cumsum([size, *self._queues]))
-        near = []
+        size = 9 + 3 * self.filter.past_samples
+        filter_part, *waiting, noise = jnp.split(by, np.cumsum([size, *self._queues]))
+        near_queues = []
         for sensor, queue, shift in zip(self.sensors, memory.waiting, waiting, strict=True):
             if queue is not None:
-                shifts = shift.reshape(sensor.times.queue, -1)
+                shifts = shift.reshape(sensor.times.longest_wait, -1)
                 queue = queue._replace(reading=jax.vmap(sensor.changed)(queue.reading, shifts))
-            near.append(queue)
+            near_queues.append(queue)
         changes = jnp.split(noise, np.cumsum([v.shape[-1] for v in memory.noise])[:-1])
         noise = tuple(jnp.add(v, change) for v, change in zip(memory.noise, changes, strict=True))
-        estimate = self.filter.retract(memory.estimate, own)
-        return memory._replace(estimate=estimate, waiting=tuple(near), noise=noise)
+        estimate = self.filter.retract(memory.estimate, filter_part)
+        return memory._replace(estimate=estimate, waiting=tuple(near_queues), noise=noise)
 
     def local_coordinates(self, memory: SuiteMemory, other: SuiteMemory) -> Float[Array, " n"]:
         """Return the local coordinates (n,) of another memory relative to a memory, to first order; see `retract`."""
         shifts = [
-            jax.vmap(sensor.change)(mine.reading, theirs.reading).reshape(-1)
-            for sensor, mine, theirs in zip(self.sensors, memory.waiting, other.waiting, strict=True)
-            if mine is not None
+            jax.vmap(sensor.change)(queue.reading, other_queue.reading).reshape(-1)
+            for sensor, queue, other_queue in zip(self.sensors, memory.waiting, other.waiting, strict=True)
+            if queue is not None
         ]
-        noise = [theirs - mine for mine, theirs in zip(memory.noise, other.noise, strict=True)]
-        own = self.filter.local_coordinates(memory.estimate, other.estimate)
-        return jnp.concatenate([own, *shifts, *noise])
+        noise = [v_other - v for v, v_other in zip(memory.noise, other.noise, strict=True)]
+        filter_part = self.filter.local_coordinates(memory.estimate, other.estimate)
+        return jnp.concatenate([filter_part, *shifts, *noise])
 
 
-def _passed(
+def _delay_reading(
     new: Delivery, waiting: Delivery | None, sensor: AttitudeSensor, now: Ticks, age: Scalar
 ) -> tuple[Delivery, Delivery | None]:
     """Return the reading that the flight software receives at a sample, and the new queue of delayed readings.
@@ -274,11 +277,11 @@ def _passed(
     times = sensor.times
     if waiting is None:
         return new, None
-    line = jax.tree.map(lambda one, queue: jnp.concatenate([one[None], queue]), new, waiting)
-    out = jax.tree.map(lambda v: v[times.wait], line)
+    all_readings = jax.tree.map(lambda one, queue: jnp.concatenate([one[None], queue]), new, waiting)
+    received = jax.tree.map(lambda v: v[times.wait], all_readings)
     if times.split:
-        later = jax.tree.map(lambda v: v[times.wait + 1], line)
-        out = guards.select(times.place(age)[0] == times.wait, out, later)
+        older = jax.tree.map(lambda v: v[times.wait + 1], all_readings)
+        received = guards.select(times.split_age(age)[0] == times.wait, received, older)
     if times.every is None:
-        out = out._replace(weight=jnp.where(times.due(now.sample), out.weight, 0.0))
-    return out, jax.tree.map(lambda v: v[:-1], line)
+        received = received._replace(weight=jnp.where(times.is_reading_due(now.sample), received.weight, 0.0))
+    return received, jax.tree.map(lambda v: v[:-1], all_readings)

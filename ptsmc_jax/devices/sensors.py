@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 
 from ptsmc_jax.devices.attitude_filter import AttitudeFilter, Estimate, attitude_filter
 from ptsmc_jax.devices.attitude_sensors import SampleTimes
-from ptsmc_jax.devices.star_times import filter_between
+from ptsmc_jax.devices.star_times import filter_between_samples
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.numerics import attitude, draws, guards
 from ptsmc_jax.numerics.draws import WholeNumber
@@ -28,7 +28,9 @@ from ptsmc_jax.plants.rigid_body import AttitudeState
 
 ATTITUDE_NOISE, RATE_NOISE, STATE_NOISE = "attitude_noise", "rate_noise", "state_noise"
 RATE_BIAS, BIAS_WALK, FILTER_START = "rate_bias", "rate_bias_walk", "filter_start"
-ATTITUDE_AND_BIAS = np.eye(9)[np.r_[0:3, 6:9]]  # rows of `Reading.start` for a filter's errors of attitude and bias
+ATTITUDE_AND_BIAS = np.eye(9)[
+    np.r_[0:3, 6:9]
+]  # rows of `MeasurementModel.start` for a filter's errors of attitude and bias
 
 
 class Sensor(ABC):
@@ -59,7 +61,7 @@ class Sensor(ABC):
             x: true state.
             now: the control period that the sample begins.
             dt: length of the period just ended [s].
-            star_x: true state at the time of `taken_ago`, for sensors with their own clock; None without them.
+            star_x: true state at the time of `newest_reading_age`, for sensors with their own clock; None without them.
         """
 
     def sample(self, memory: Any, x: Any, now: Ticks, dt: Scalar, star_x: Any = None) -> tuple[Any, Any]:
@@ -75,20 +77,20 @@ class Sensor(ABC):
         named = {"attitude": read.q, "rate": read.w} if isinstance(read, AttitudeState) else {"x": read}
         return named, memory
 
-    def remembered(self, memory: Any) -> dict[str, Array]:
+    def filter_state(self, memory: Any) -> dict[str, Array]:
         """Return the filter estimates that are part of the state of exported C, by name."""
         return {}
 
     @abstractmethod
-    def quiet(self) -> Any:
+    def without_noise(self) -> Any:
         """Return the sensor without noise."""
 
-    def in_step(self) -> Any:
+    def at_control_samples(self) -> Any:
         """Return an equivalent sensor with all samples at control samples, for linear theory; see `Sensors`."""
         return self
 
-    def taken_ago(self, sample: Array, dt: Scalar) -> Any:
-        """Return how long before a control sample sensors with their own clock took their newest reading [s].
+    def newest_reading_age(self, sample: Array, dt: Scalar) -> Any:
+        """Return the ages [s] of the newest readings of sensors with their own clock at a control sample.
 
         Args:
             sample: number of the control sample.
@@ -100,8 +102,8 @@ class Sensor(ABC):
         """
         return None
 
-    def drawn(self, seed: WholeNumber, trial: WholeNumber) -> dict[str, Array]:
-        """Return random numbers that are constant in a trial, such as a bias [rad/s], by column name."""
+    def trial_constants(self, seed: WholeNumber, trial: WholeNumber) -> dict[str, Array]:
+        """Return random quantities that are constant in a trial, such as a bias [rad/s], by column name."""
         return {}
 
 
@@ -119,12 +121,12 @@ class PerfectSensors(Sensor):
         """Return the true state; dt in [s]."""
         return x, None
 
-    def quiet(self) -> "PerfectSensors":
+    def without_noise(self) -> "PerfectSensors":
         """Return the sensors themselves."""
         return self
 
 
-class Reading(NamedTuple):
+class MeasurementModel(NamedTuple):
     """Linear measurement model of a sensor near the true state, for `lower_bound`.
 
     The coordinates are the local coordinates (n,) of the plant, see `Plant.retract`, and the sensor's own states
@@ -137,7 +139,8 @@ class Reading(NamedTuple):
     own_drift: np.ndarray  # (own,) 1 sigma of their change in a control period, per second
     # prior knowledge at t = 0: rows (k, n + own), and a factor (k, k) of their covariance
     start: tuple[np.ndarray, np.ndarray] | None = None
-    early: np.ndarray | None = None  # (m,) bool: readings at the time of `control_period.star_state`; None if none
+    # (m,) bool: readings taken before the control sample, see `control_period.star_state`; None: there are none
+    early: np.ndarray | None = None
 
 
 class Memory(NamedTuple):
@@ -186,7 +189,7 @@ class SpacecraftSensors(Sensor):
             return jnp.zeros(3)
         return self.rate_bias * draws.normals(draws.stream(seed, trial, RATE_BIAS), 3)
 
-    def drawn(self, seed: WholeNumber, trial: WholeNumber) -> dict[str, Array]:
+    def trial_constants(self, seed: WholeNumber, trial: WholeNumber) -> dict[str, Array]:
         """Return the gyro bias at the first sample [rad/s]."""
         if self.rate_bias is None and self.given_bias is None:
             return {}
@@ -248,7 +251,9 @@ class Sensors(SpacecraftSensors):
     rate_scale: Leaf | None = None  # (3,) ratio of gyro reading to true rate [-]
     outage: Leaf | None = None  # (2,) start and end of an outage of the star tracker [s]; with a filter
     own_times: SampleTimes | None = None  # sample times of a star tracker with its own clock, with a filter
-    noise_free: bool = field(default=False, metadata={"static": True})  # whether no noise is generated, see `quiet`
+    noise_free: bool = field(
+        default=False, metadata={"static": True}
+    )  # whether no noise is generated, see `without_noise`
 
     def star_attitude(self, q: Float[Array, "4"]) -> Float[Array, "4"]:
         """Return the attitude (4,) of the star tracker for an attitude of the body, both unit quaternions."""
@@ -263,7 +268,7 @@ class Sensors(SpacecraftSensors):
         if self.own_times is None:
             return replace(self, filter=attitude_filter(bandwidth, *noises, period, self.every))
         times = self.own_times
-        return replace(self, filter=filter_between(bandwidth, *noises, period, times.interval, times.pattern))
+        return replace(self, filter=filter_between_samples(bandwidth, *noises, period, times.interval, times.pattern))
 
     def bandwidth(self, period: Any) -> Any:
         """Return the bandwidth of the filter [rad/s] for a control period [s]."""
@@ -302,15 +307,15 @@ class Sensors(SpacecraftSensors):
         """Return the weight of the star tracker measurement at this sample; 0 if there is none."""
         due, t = now.sample % self.every == 0, now.t
         if self.own_times is not None:
-            due, t = self.own_times.due(now.sample), now.t - self.own_times.age(now.sample)
+            due, t = self.own_times.is_reading_due(now.sample), now.t - self.own_times.delivered_age(now.sample)
         return self.outside_outage(jnp.where(due, now.noise_weight, 0.0), t)
 
-    def taken_ago(self, sample: Int[Array, ""], dt: Scalar) -> Scalar | None:
+    def newest_reading_age(self, sample: Int[Array, ""], dt: Scalar) -> Scalar | None:
         """Return the age of the star tracker's newest measurement at a sample [s], at most dt [s].
 
         dt is the length of the period before the sample. The result is None for a star tracker without its own clock.
         """
-        return None if self.own_times is None else self.own_times.taken_ago(sample, dt)
+        return None if self.own_times is None else self.own_times.newest_reading_age(sample, dt)
 
     def inputs(
         self, memory: Memory, x: AttitudeState, now: Ticks, dt: Scalar, star_x: AttitudeState | None = None
@@ -318,12 +323,12 @@ class Sensors(SpacecraftSensors):
         """Return the inputs of exported C. A filter also needs a flag for a valid attitude, and its age [s]."""
         named, memory = super().inputs(memory, x, now, dt, star_x)
         if self.filter is not None:
-            age = self.taken_ago(now.sample, dt)
+            age = self.newest_reading_age(now.sample, dt)
             named["attitude_valid"] = (self.star_weight(now) > 0.0).astype(float)
             named |= {} if age is None else {"attitude_age": age}
         return named, memory
 
-    def remembered(self, memory: Memory) -> dict[str, Array]:
+    def filter_state(self, memory: Memory) -> dict[str, Array]:
         """Return the filter's attitude and bias, and the last gyro sample [rad/s], by their names in exported C."""
         if memory.estimate is None:
             return {}
@@ -341,16 +346,16 @@ class Sensors(SpacecraftSensors):
             estimate = self.filter.correct(self.filter.propagate(old, rate, read.w, dt), read.q, weight)
         else:
             # without a measurement the age is the length of the period, as in exported C
-            age = jnp.where(weight > 0.0, self.own_times.taken_ago(now.sample, dt), dt)
+            age = jnp.where(weight > 0.0, self.own_times.newest_reading_age(now.sample, dt), dt)
             estimate = self.filter.correct_between(old, rate, read.w, dt, read.q, age, weight)
         return AttitudeState(estimate.q, read.w - estimate.bias), memory_next._replace(estimate=estimate, rate=read.w)
 
-    def quiet(self) -> "Sensors":
+    def without_noise(self) -> "Sensors":
         """Return the sensors without noise and bias; the filter gains are unchanged."""
-        exact = self.filter and replace(self.filter, spread=0.0 * self.filter.spread)
+        exact_filter = self.filter and replace(self.filter, spread=0.0 * self.filter.spread)
         zero = jnp.zeros_like(jnp.asarray(self.attitude_noise))
-        quiet = replace(self, attitude_noise=zero, rate_noise=zero, filter=exact, noise_free=True)
-        return replace(quiet, rate_bias=None, bias_rate=None, given_bias=None)
+        noiseless = replace(self, attitude_noise=zero, rate_noise=zero, filter=exact_filter, noise_free=True)
+        return replace(noiseless, rate_bias=None, bias_rate=None, given_bias=None)
 
     def retract(self, memory: Memory, by: Float[Array, " n"]) -> Memory:
         """Return the memory at local coordinates (n,) relative to another memory.
@@ -370,7 +375,7 @@ class Sensors(SpacecraftSensors):
         turn = attitude.small_rotation(memory.estimate.q, other.estimate.q)
         return jnp.concatenate([turn, other.estimate.bias - memory.estimate.bias, other.rate - memory.rate])
 
-    def reading(self, sample: int = 0, fraction: float = 1.0) -> Reading:
+    def measurement_model(self, sample: int = 0, fraction: float = 1.0) -> MeasurementModel:
         """Return the linear measurement model: rotation [rad] and rate with bias [rad/s], at each control sample.
 
         Args:
@@ -379,21 +384,21 @@ class Sensors(SpacecraftSensors):
         """
         star, gyro = (float(v) for v in (self.attitude_noise, self.rate_noise))
         bias, drift = (0.0 if v is None else float(v) for v in (self.rate_bias, self.bias_rate))
-        start = early = None
+        start = between_samples = None
         if self.filter is not None:
-            root = np.asarray(self.filter.first_spread(sample, jnp.asarray(fraction)))
-            start = ATTITUDE_AND_BIAS, np.kron(root, np.eye(3))
+            factor = np.asarray(self.filter.first_spread(sample, jnp.asarray(fraction)))
+            start = ATTITUDE_AND_BIAS, np.kron(factor, np.eye(3))
         if self.own_times is not None:
-            early = np.repeat([True, False], 3)
+            between_samples = np.repeat([True, False], 3)
         rows, noise = np.vstack([np.eye(3, 9), self.gyro_rows()]), np.repeat([star, gyro], 3)
-        return Reading(rows, noise, np.full(3, bias), np.full(3, drift), start, early)
+        return MeasurementModel(rows, noise, np.full(3, bias), np.full(3, drift), start, between_samples)
 
     def available(self, now: Ticks) -> np.ndarray:
         """Return whether each reading is available at each control sample, (N, 6) bool."""
         star = np.asarray(jax.vmap(self.star_weight)(now)) > 0.0
         return np.repeat(np.stack([star, np.ones_like(star)], axis=1), 3, axis=1)
 
-    def in_step(self) -> "Sensors":
+    def at_control_samples(self) -> "Sensors":
         """Return sensors whose star tracker samples at every control sample, if it has its own clock.
 
         The weight of a measurement is multiplied by period / interval, and its noise is increased, so that the mean
@@ -434,14 +439,14 @@ class StateSensor(Sensor):
         noise_next = self.noise(key, now.sample + 1)
         return x + guards.lerp(now.noise_weight, noise, noise_next), (key, noise_next)
 
-    def quiet(self) -> "StateSensor":
+    def without_noise(self) -> "StateSensor":
         """Return the sensor without noise."""
         return replace(self, sigma=0.0 * self.sigma)
 
-    def reading(self, sample: int = 0, fraction: float = 1.0) -> Reading:
+    def measurement_model(self, sample: int = 0, fraction: float = 1.0) -> MeasurementModel:
         """Return the linear measurement model: every state, at each control sample."""
         sigma = np.asarray(self.sigma)
-        return Reading(np.eye(sigma.size), sigma, np.zeros(0), np.zeros(0))
+        return MeasurementModel(np.eye(sigma.size), sigma, np.zeros(0), np.zeros(0))
 
     def available(self, now: Ticks) -> np.ndarray:
         """Return whether each reading is available at each control sample, (N, n) bool."""

@@ -87,7 +87,8 @@ def _to_matrices(rows: np.ndarray) -> np.ndarray:
 def _check_inertia(rows: np.ndarray) -> np.ndarray:
     full = _to_matrices(rows)
     UnfitError.check(
-        formulas.bodies(full), lambda k: f"a rigid body's inertia ({error_message(formulas.check_inertia, full[k])})"
+        formulas.is_rigid_body(full),
+        lambda k: f"a rigid body's inertia ({error_message(formulas.check_inertia, full[k])})",
     )
     return rows
 
@@ -107,7 +108,7 @@ def _check_flexible_body(given: Given, parts: Parts) -> None:
     if "mode_coupling" in given:
         changed, coupling = "coupling", given["mode_coupling"].reshape(coupling.shape)
     UnfitError.check(
-        formulas.flexible_bodies(inertia, coupling),
+        formulas.is_flexible_body(inertia, coupling),
         lambda k: f"a flexible body's {changed} ({error_message(formulas.rest_inertia, inertia[k], coupling[k])})",
     )
 

@@ -32,19 +32,19 @@ class Animation:
         Path(path).write_text(page, encoding="utf-8")
 
 
-def turned(q: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+def rotate_to_inertial(q: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     """Return vectors (n, 3) of the body in inertial axes; q (4,) scalar last, body relative to inertial."""
     v, scalar = q[:3], q[3]
     return vectors + 2.0 * np.cross(v, np.cross(v, vectors) + scalar * vectors)
 
 
-def body(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def body_edges_and_axes(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the edges of the box (12, 2, 3) and the body axes (3, 2, 3), both ends, in inertial axes; q (4,)."""
-    tips = turned(q, np.eye(3))
-    return turned(q, _CORNERS)[_EDGES], np.stack([np.zeros_like(tips), tips], axis=1)
+    tips = rotate_to_inertial(q, np.eye(3))
+    return rotate_to_inertial(q, _CORNERS)[_EDGES], np.stack([np.zeros_like(tips), tips], axis=1)
 
 
-def of_run(parts: Parts, log: Log, frames: int = 40) -> Animation:
+def animate_run(parts: Parts, log: Log, frames: int = 40) -> Animation:
     """Animate the body of a run with its axes; the axes of the reference are dashed.
 
     Args:
@@ -63,8 +63,8 @@ def of_run(parts: Parts, log: Log, frames: int = 40) -> Animation:
     if frames < 2:
         raise ValueError(f"frames is {frames}, but must be at least 2")
     t = np.asarray(log.t)
-    shown = np.searchsorted(t, np.linspace(0.0, t[-1], frames) * (1.0 - 1e-12))
-    q, q_f = np.asarray(log.x.q)[shown], np.broadcast_to(np.asarray(log.reference.q), (len(t), 4))[shown]
+    samples = np.searchsorted(t, np.linspace(0.0, t[-1], frames) * (1.0 - 1e-12))
+    q, q_f = np.asarray(log.x.q)[samples], np.broadcast_to(np.asarray(log.reference.q), (len(t), 4))[samples]
     with matplotlib.rc_context({**RC, "animation.embed_limit": 1e4}):  # MB; beyond it frames would be dropped
         figure = Figure(figsize=(4.6, 4.6), dpi=70)
         axes = figure.add_subplot(projection="3d")
@@ -76,15 +76,19 @@ def of_run(parts: Parts, log: Log, frames: int = 40) -> Animation:
         title = axes.set_title("")
 
         def draw(k: int) -> list:
-            edges, axes_of_body = body(q[k])
-            for lines, ends in ((box, edges), (body_axes, axes_of_body), (reference_axes, body(q_f[k])[1])):
-                for line, both in zip(lines, ends, strict=True):
-                    line.set_data_3d(*both.T)
-            title.set_text(f"t = {t[shown[k]]:.1f} s; dashed: reference")
+            edges, axes_of_body = body_edges_and_axes(q[k])
+            for lines, ends in (
+                (box, edges),
+                (body_axes, axes_of_body),
+                (reference_axes, body_edges_and_axes(q_f[k])[1]),
+            ):
+                for line, endpoints in zip(lines, ends, strict=True):
+                    line.set_data_3d(*endpoints.T)
+            title.set_text(f"t = {t[samples[k]]:.1f} s; dashed: reference")
             return [*box, *body_axes, *reference_axes, title]
 
         content = FuncAnimation(figure, draw, frames=frames, interval=120).to_jshtml(default_mode="once")
-    return Animation(_alone(content))
+    return Animation(_remove_links(content))
 
 
 # matplotlib's icons come from a font on the internet; these characters replace them
@@ -95,7 +99,7 @@ _ICONS = {
 }  # fmt: skip
 
 
-def _alone(content: str) -> str:
+def _remove_links(content: str) -> str:
     """Return the page without parts that are loaded from the internet."""
     for name, icon in _ICONS.items():
         content = content.replace(f'<i class="fa {name}"></i>', icon)

@@ -8,16 +8,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ptsmc_jax.figures.style import LIMIT, STYLES, figure_of, logarithmic, shown_error, styled, with_unit
+from ptsmc_jax.figures.style import LIMIT, STYLES, error_display, logarithmic, new_figure, styled, with_unit
 from ptsmc_jax.formulas import angle_unit
 from ptsmc_jax.simulation.catalogues import percent
 from ptsmc_jax.simulation.requirements import quantity
 
 BANDS = ((99.7, "0.85"), (90.0, "0.68"), (50.0, "0.45"))  # central fraction of the trials [%], grey
-# runs to the end that violate a limit on fractions of time, which may be met all the same, or on trials
+# outcomes of complete runs beyond a limit: a limit on a fraction of the time may still be met
 AT_TIMES = "beyond a limit that may be left at times"
 BEYOND = "beyond a limit"
-COMPLETE = ("ok", AT_TIMES, BEYOND, "not_converged")  # to the end
+COMPLETE = ("ok", AT_TIMES, BEYOND, "not_converged")  # outcomes of trials that reached the end
 # outcome: colour, marker, size
 MARKS = {
     "ok": (STYLES[0][0], "o", 6.0),
@@ -36,7 +36,7 @@ class Column(NamedTuple):
     unit: str  # empty: no unit
     values: np.ndarray  # (trials,), NaN if a trial has no value
     limit: float | None = None  # required
-    of_time: str = ""  # of a requirement on a fraction of time: required and observed fraction
+    of_time: str = ""  # required and observed fraction, if the requirement is on a fraction of the time
 
     def label(self, name: str) -> str:
         """Return the name with the unit."""
@@ -70,10 +70,10 @@ def fan(t: np.ndarray, errors: np.ndarray, worst: tuple[int, np.ndarray], t_f: f
         t_f: the prescribed time [s].
         kind: of the plant; it determines the unit.
     """
-    shown, name, unit = shown_error(kind)
-    errors, largest = shown(errors), shown(worst[1])
+    convert, name, unit = error_display(kind)
+    errors, largest = convert(errors), convert(worst[1])
     trials = f"{len(errors)} trial{'s' if len(errors) != 1 else ''}"
-    figure, axes = figure_of(f"{name.capitalize()} of {trials}, median in white", with_unit(name, unit))
+    figure, axes = new_figure(f"{name.capitalize()} of {trials}, median in white", with_unit(name, unit))
     for central, grey in BANDS:
         low, high = np.percentile(errors, [50.0 - central / 2, 50.0 + central / 2], axis=0)
         axes.fill_between(t, low, high, color=grey, lw=0.0, label=f"{central:g} % of the trials")
@@ -116,17 +116,17 @@ def distributions(metrics: Mapping[str, Column]) -> Figure:
             logarithmic(axes, "x")
         if column.limit is not None:
             axes.axvline(column.limit, color=STYLES[1][0], ls="--", label=column.within())
-            axes.legend(fontsize=9, loc=_free(axes, column.limit, ordered[:known]))
+            axes.legend(fontsize=9, loc=_legend_place(axes, column.limit, ordered[:known]))
         axes.set(xlabel=column.label(name), ylabel="fraction of the trials")
     return figure
 
 
-def _free(axes: Axes, limit: float, ordered: np.ndarray) -> str:
+def _legend_place(axes: Axes, limit: float, ordered: np.ndarray) -> str:
     """Return a place for the legend that covers neither the rising curve nor the line of the limit."""
     axes.autoscale_view()  # matplotlib would do it when it draws
-    place = axes.transData + axes.transAxes.inverted()
-    at, *ends = (place.transform((x, 0.5))[0] for x in (limit, *ordered[:1], *ordered[-1:]))
-    if at > 0.5:
+    transform = axes.transData + axes.transAxes.inverted()
+    limit_position, *ends = (transform.transform((x, 0.5))[0] for x in (limit, *ordered[:1], *ordered[-1:]))
+    if limit_position > 0.5:
         return "upper left" if not ends or ends[1] > 0.5 else "center"
     return "lower right" if not ends or ends[0] < 0.5 else "center"
 
@@ -145,8 +145,8 @@ def torque_by_angle(
         outcome: one of `MARKS` for each, (trials,).
         totals: how many trials of the whole campaign have each outcome.
     """
-    figure, axes = figure_of("Peak torque by initial error", torque.label("peak torque"))
-    _points(axes, start.values, torque.values, outcome, totals)
+    figure, axes = new_figure("Peak torque by initial error", torque.label("peak torque"))
+    _scatter_by_outcome(axes, start.values, torque.values, outcome, totals)
     axes.set_xlabel(start.label("initial angle" if start.unit in ("deg", "arcsec") else "initial error"))
     limit = torque.limit
     if limit is not None:
@@ -174,7 +174,7 @@ def inputs(
     for line, (metric, column) in zip(grid, metrics.items(), strict=True):
         known = column.values[np.isfinite(column.values)]
         for axes, x in zip(line, drawn.values(), strict=True):
-            _points(axes, x.values, column.values, outcome, totals)
+            _scatter_by_outcome(axes, x.values, column.values, outcome, totals)
             if column.limit is not None:
                 axes.axhline(column.limit, **LIMIT)
             if known.size and known.min() > 0.0 and known.max() > 10.0 * known.min():
@@ -188,10 +188,21 @@ def inputs(
     return figure
 
 
-def _points(axes: Axes, x: np.ndarray, y: np.ndarray, outcome: np.ndarray, totals: Mapping[str, int]) -> None:
+def _scatter_by_outcome(
+    axes: Axes, x: np.ndarray, y: np.ndarray, outcome: np.ndarray, totals: Mapping[str, int]
+) -> None:
     for name, (colour, marker, size) in MARKS.items():
-        those = outcome == name
-        if np.any(those):
+        has_outcome = outcome == name
+        if np.any(has_outcome):
             label = f"{name.replace('_', ' ')}: {totals[name]}"
             width = 1.2 if marker in ("x", "+") else 0.0  # line markers are invisible without a width
-            axes.scatter(x[those], y[those], s=size, c=colour, marker=marker, alpha=0.6, label=label, linewidths=width)
+            axes.scatter(
+                x[has_outcome],
+                y[has_outcome],
+                s=size,
+                c=colour,
+                marker=marker,
+                alpha=0.6,
+                label=label,
+                linewidths=width,
+            )

@@ -11,40 +11,40 @@ from ptsmc_jax.figures import style
 from ptsmc_jax.identification import results
 from ptsmc_jax.identification.estimation import Fit, Identification
 
-POINTS = 4000  # of a line
+POINTS = 4000  # largest number of points of a line
 UNITS = {"attitude": "rad", "rate": "rad/s"}  # units of innovations
 
 
-def figures_of(found: Identification) -> dict[str, Figure]:
+def identification_figures(identification: Identification) -> dict[str, Figure]:
     """Return the figures by name; those of the second log and of later ones have its number."""
-    figures: dict[str, Figure] = {"estimates": estimates(found.table())}
-    for k, fit in enumerate([*found.fits, *found.validation]):
-        end = "" if k == 0 else f"_{k + 1}"
+    figures: dict[str, Figure] = {"estimates": estimates(identification.table())}
+    for k, fit in enumerate([*identification.fits, *identification.validation]):
+        suffix = "" if k == 0 else f"_{k + 1}"
         names, t = results.components(fit), fit.log.t[1:]
         values, sigma = results.innovations(fit)
         labels = [style.with_unit(name, UNITS.get(name.split("_")[0], "")) for name in names]
-        figures[f"innovations{end}"] = innovations(t, labels, values, sigma)
+        figures[f"innovations{suffix}"] = innovations(t, labels, values, sigma)
         counts = np.sum(np.isfinite(values), axis=0)
-        figures[f"autocorrelation{end}"] = autocorrelation(names, fit.autocorrelation(), counts)
-        figures[f"prediction{end}"] = signals(t, _predictions(fit, values))
+        figures[f"autocorrelation{suffix}"] = autocorrelation(names, fit.autocorrelation(), counts)
+        figures[f"prediction{suffix}"] = signals(t, _predictions(fit, values))
     return figures
 
 
 def _predictions(fit: Fit, values: np.ndarray) -> list[tuple[str, np.ndarray, np.ndarray]]:
     """Return label, measured and predicted values of each signal; the attitude is the rotation from the first row."""
-    panels, at = [], 0
+    panels, first_column = [], 0
     for name, readings in fit.log.readings.items():
         measured = readings[1:]
         size = 3 if name == "attitude" else readings.shape[1]
-        errors = values[:, at : at + size]
-        at += size
+        errors = values[:, first_column : first_column + size]
+        first_column += size
         if name == "attitude":
-            there = ~np.isnan(measured[:, 0]) & ~np.isnan(errors[:, 0])
+            has_reading = ~np.isnan(measured[:, 0]) & ~np.isnan(errors[:, 0])
             angles, predicted = np.full((len(measured), 3), np.nan), np.full((len(measured), 3), np.nan)
-            first, now = Rotation.from_quat(readings[0]), Rotation.from_quat(measured[there])
-            angles[there] = np.rad2deg((first.inv() * now).as_rotvec())
-            back = now * Rotation.from_rotvec(-errors[there])
-            predicted[there] = np.rad2deg((first.inv() * back).as_rotvec())
+            first_attitude, attitudes = Rotation.from_quat(readings[0]), Rotation.from_quat(measured[has_reading])
+            angles[has_reading] = np.rad2deg((first_attitude.inv() * attitudes).as_rotvec())
+            predicted_attitudes = attitudes * Rotation.from_rotvec(-errors[has_reading])
+            predicted[has_reading] = np.rad2deg((first_attitude.inv() * predicted_attitudes).as_rotvec())
             panels.append(("rotation [deg]", angles, predicted))
         else:
             label = "rate [rad/s]" if name == "rate" else "state"
@@ -56,14 +56,14 @@ def _panels(labels: Sequence[str], title: str, xlabel: str = style.TIME) -> tupl
     """Return a figure with a plot for each label, and the plots."""
     figure = Figure(figsize=(8.0, 1.0 + 1.5 * len(labels)), layout="constrained")
     axes = np.ravel(figure.subplots(len(labels), 1, sharex=True))
-    for one, label in zip(axes, labels, strict=True):
-        one.set_ylabel(label)
+    for panel, label in zip(axes, labels, strict=True):
+        panel.set_ylabel(label)
     axes[0].set_title(title, loc="left")
     axes[-1].set_xlabel(xlabel)
     return figure, axes
 
 
-def _some(count: int) -> np.ndarray:
+def _select_rows(count: int) -> np.ndarray:
     """Return the rows of a log that are drawn, at most `POINTS`."""
     return np.unique(np.linspace(0, count - 1, min(POINTS, count)).round().astype(int))
 
@@ -77,11 +77,11 @@ def signals(t: np.ndarray, panels: list[tuple[str, np.ndarray, np.ndarray]]) -> 
         panels: label, measured and predicted values (rows, components) of each signal.
     """
     figure, axes = _panels([label for label, *_ in panels], "Measured (dots) and predicted (lines)")
-    kept = _some(len(t))
-    for one, (_, measured, predicted) in zip(axes, panels, strict=True):
+    drawn = _select_rows(len(t))
+    for panel, (_, measured, predicted) in zip(axes, panels, strict=True):
         for k, (colour, _) in zip(range(measured.shape[1]), style.STYLES, strict=False):
-            one.plot(t[kept], measured[kept, k], ".", ms=2, color=colour, alpha=0.4)
-            one.plot(t[kept], predicted[kept, k], "-", lw=0.9, color=colour, label=f"component {k + 1}")
+            panel.plot(t[drawn], measured[drawn, k], ".", ms=2, color=colour, alpha=0.4)
+            panel.plot(t[drawn], predicted[drawn, k], "-", lw=0.9, color=colour, label=f"component {k + 1}")
     axes[0].legend(ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0))
     return figure
 
@@ -97,15 +97,15 @@ def innovations(t: np.ndarray, names: list[str], values: np.ndarray, sigma: np.n
         sigma: their 1 sigma (rows, components).
     """
     figure, axes = _panels(names, "Innovations and their 3 sigma bands")
-    kept = _some(len(t))
-    for k, one in enumerate(axes):
+    selected = _select_rows(len(t))
+    for k, panel in enumerate(axes):
         band = np.where(np.isfinite(values[:, k]), 3.0 * sigma[:, k], np.nan)
-        there = kept[np.isfinite(band[kept])]
-        one.fill_between(t[there], -band[there], band[there], color="0.9")
-        one.plot(t[there], values[there, k], ".", ms=2, color=style.STYLES[0][0])
-        if there.size:  # the first bands may be wide, because little is known of the state at the start
-            reach = 1.5 * max(np.nanquantile(band, 0.9), np.nanquantile(np.abs(values[:, k]), 0.99))
-            one.set_ylim(-reach, reach)
+        drawn = selected[np.isfinite(band[selected])]
+        panel.fill_between(t[drawn], -band[drawn], band[drawn], color="0.9")
+        panel.plot(t[drawn], values[drawn, k], ".", ms=2, color=style.STYLES[0][0])
+        if drawn.size:  # the first bands may be wide, because little is known of the state at the start
+            half_height = 1.5 * max(np.nanquantile(band, 0.9), np.nanquantile(np.abs(values[:, k]), 0.99))
+            panel.set_ylim(-half_height, half_height)
     return figure
 
 
@@ -120,10 +120,10 @@ def autocorrelation(names: list[str], values: np.ndarray, counts: np.ndarray) ->
     """
     figure, axes = _panels(names, "Autocorrelation of the innovations and its 95 % band", "lag [readings]")
     lags = np.arange(1, len(values) + 1)
-    for k, one in enumerate(axes):
-        reach = 1.96 / np.sqrt(max(counts[k], 1))
-        one.axhspan(-reach, reach, color="0.9")
-        one.vlines(lags, 0.0, values[:, k], color=style.STYLES[0][0])
+    for k, panel in enumerate(axes):
+        half_width = 1.96 / np.sqrt(max(counts[k], 1))
+        panel.axhspan(-half_width, half_width, color="0.9")
+        panel.vlines(lags, 0.0, values[:, k], color=style.STYLES[0][0])
     return figure
 
 
@@ -137,14 +137,16 @@ def estimates(table: Any) -> Figure:
     figure = Figure(figsize=(8.0, 1.2 + 0.4 * len(rows)), layout="constrained")
     axes = figure.subplots()
     for k, row in enumerate(rows):
-        alike = [
-            one for one in rows if one["parameter"].rstrip("0123456789ab") == row["parameter"].rstrip("0123456789ab")
+        same_parameter = [
+            other
+            for other in rows
+            if other["parameter"].rstrip("0123456789ab") == row["parameter"].rstrip("0123456789ab")
         ]
-        size = max(max(abs(one["start"]), abs(one["estimate"])) for one in alike) or 1.0
-        change, reach = 100.0 * (row["estimate"] - row["start"]) / size, 196.0 * row["std"] / size
+        size = max(max(abs(other["start"]), abs(other["estimate"])) for other in same_parameter) or 1.0
+        change, half_width = 100.0 * (row["estimate"] - row["start"]) / size, 196.0 * row["std"] / size
         if np.isfinite(row["prior_std"]):
             axes.errorbar(0.0, k + 0.2, xerr=196.0 * row["prior_std"] / size, color="0.6", capsize=3, fmt="o", ms=3)
-        axes.errorbar(change, k, xerr=reach, color=style.STYLES[0][0], capsize=3, fmt="o", ms=4)
+        axes.errorbar(change, k, xerr=half_width, color=style.STYLES[0][0], capsize=3, fmt="o", ms=4)
     axes.set_yticks(range(len(rows)), [row["parameter"] for row in rows])
     axes.invert_yaxis()
     axes.set_title("Estimates with 95 % intervals; grey: prior knowledge", loc="left")
@@ -156,7 +158,7 @@ def estimates(table: Any) -> Figure:
 def profile(t: np.ndarray, panels: list[tuple[str, np.ndarray]]) -> Figure:
     """Draw a proposed manoeuvre over time; panels: label and values (rows, components) of each signal, t: in s."""
     figure, axes = _panels([label for label, _ in panels], "Proposed manoeuvre")
-    for one, (_, values) in zip(axes, panels, strict=True):
+    for panel, (_, values) in zip(axes, panels, strict=True):
         for column, (colour, line) in zip(values.T, style.STYLES, strict=False):
-            one.plot(t, column, color=colour, ls=line)
+            panel.plot(t, column, color=colour, ls=line)
     return figure

@@ -9,12 +9,12 @@ from ptsmc_jax.figures.style import STYLES, plain_ticks, styled
 from ptsmc_jax.theory.margins import Margins
 
 CONTOUR = 6.0  # sensitivity of the contour [dB]
-DEEPEST = 40.0  # largest and smallest |L| that is drawn [dB]
+LARGEST_SHOWN = 40.0  # largest and smallest |L| that is drawn [dB]
 
 
-def _decibels(seen: np.ndarray) -> np.ndarray:
+def _decibels(values: np.ndarray) -> np.ndarray:
     """Return sizes [dB], far below the axis for 0, as of a saturated command."""
-    return 20.0 * np.log10(np.maximum(np.abs(seen), 1e-9))
+    return 20.0 * np.log10(np.maximum(np.abs(values), 1e-9))
 
 
 @styled
@@ -24,15 +24,15 @@ def nichols(L: np.ndarray, names: Sequence[str]) -> Figure:
     axes = figure.subplots()
     for k, name in enumerate(names):
         size, phase = _decibels(L[:, k]), np.rad2deg(np.unwrap(np.angle(L[:, k])))
-        near = np.argmin(np.abs(size))  # choose the branch with the crossing of 0 dB nearest to -180 degrees
-        phase = phase - 360.0 * np.round((phase[near] + 180.0) / 360.0)
+        crossing = np.argmin(np.abs(size))  # choose the branch with the crossing of 0 dB nearest to -180 degrees
+        phase = phase - 360.0 * np.round((phase[crossing] + 180.0) / 360.0)
         colour, style = STYLES[k % len(STYLES)]
         axes.plot(phase, size, color=colour, ls=style, label=name)
-    around = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 721)) * 10.0 ** (-CONTOUR / 20.0) - 1.0
-    angle = np.rad2deg(np.angle(around)) % 360.0 - 360.0
-    axes.plot(angle, _decibels(around), color="0.35", lw=1.0, label=f"sensitivity {CONTOUR:g} dB")
+    contour = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 721)) * 10.0 ** (-CONTOUR / 20.0) - 1.0
+    angle = np.rad2deg(np.angle(contour)) % 360.0 - 360.0
+    axes.plot(angle, _decibels(contour), color="0.35", lw=1.0, label=f"sensitivity {CONTOUR:g} dB")
     axes.plot(-180.0, 0.0, "+", color="0.0", ms=12, mew=1.6)
-    axes.set(xlabel="phase of L [deg]", ylabel="|L| [dB]", ylim=(-DEEPEST, DEEPEST))
+    axes.set(xlabel="phase of L [deg]", ylabel="|L| [dB]", ylim=(-LARGEST_SHOWN, LARGEST_SHOWN))
     axes.set_title("Nominal loop, opened at the plant's input, hold phase", loc="left")
     axes.legend()
     return figure
@@ -43,21 +43,21 @@ def sensitivity(w: np.ndarray, L: np.ndarray, names: Sequence[str]) -> Figure:
     """Plot |S| = |1 / (1 + L)| and |T| = |L / (1 + L)| over the frequency w [rad/s]; L (points, axes)."""
     figure = Figure(figsize=(8.0, 4.5), layout="constrained")
     axes = figure.subplots()
-    shown = w > w[-1] * 1e-4
+    is_shown = w > w[-1] * 1e-4
     for k, name in enumerate(names):
         colour, _ = STYLES[k % len(STYLES)]
-        for letter, seen, style in (("S", 1.0 / (1.0 + L[:, k]), "-"), ("T", L[:, k] / (1.0 + L[:, k]), "--")):
-            size = _decibels(seen)
-            axes.semilogx(w[shown], size[shown], color=colour, ls=style, label=f"{letter} {name}")
+        for letter, transfer, style in (("S", 1.0 / (1.0 + L[:, k]), "-"), ("T", L[:, k] / (1.0 + L[:, k]), "--")):
+            size = _decibels(transfer)
+            axes.semilogx(w[is_shown], size[is_shown], color=colour, ls=style, label=f"{letter} {name}")
     axes.axhline(CONTOUR, color="0.35", lw=1.0, ls=":")
-    axes.set(xlabel="frequency [rad/s]", ylabel="size [dB]", ylim=(-DEEPEST, 15.0))
+    axes.set(xlabel="frequency [rad/s]", ylabel="size [dB]", ylim=(-LARGEST_SHOWN, 15.0))
     axes.set_title("Sensitivity S and complementary sensitivity T, nominal loop, hold phase", loc="left")
     axes.legend(ncols=len(names))
     return figure
 
 
 @styled
-def over_time(left: np.ndarray, before: Margins, hold: Margins) -> Figure:
+def margins_over_time(time_to_go: np.ndarray, before: Margins, hold: Margins) -> Figure:
     """Plot the margins of the worst axis against time to go (times,) [s], and of the hold phase as lines."""
     figure = Figure(figsize=(8.0, 6.5), layout="constrained")
     rows = figure.subplots(3, 1, sharex=True)
@@ -65,16 +65,16 @@ def over_time(left: np.ndarray, before: Margins, hold: Margins) -> Figure:
     for axes, (label, *names) in zip(rows, panels, strict=True):
         for name, (colour, style) in zip(names, STYLES, strict=False):
             values = np.where(before.stable[:, 0], getattr(before, name).min(axis=1), np.nan)
-            axes.semilogx(left, values, color=colour, ls=style, marker=".", label=name.replace("_", " "))
+            axes.semilogx(time_to_go, values, color=colour, ls=style, marker=".", label=name.replace("_", " "))
             worst = float(getattr(hold, name).min())
             if np.isfinite(worst):
                 axes.axhline(worst, color=colour, lw=1.0, ls=":", label=f"hold phase: {worst:.3g}")
         limited = any(np.isfinite(getattr(margins, name)).any() for margins in (before, hold) for name in names)
         if not limited:
             axes.text(0.5, 0.5, "without a limit", transform=axes.transAxes, ha="center", va="center")
-        lost = left[~before.stable[:, 0]]
-        if lost.size:
-            axes.plot(lost, np.zeros_like(lost), "x", color="0.3", label="frozen loop unstable")
+        unstable_times = time_to_go[~before.stable[:, 0]]
+        if unstable_times.size:
+            axes.plot(unstable_times, np.zeros_like(unstable_times), "x", color="0.3", label="frozen loop unstable")
         axes.set(ylabel=label, ylim=(0.0, None))
         axes.legend(fontsize=9, ncols=2)
     rows[-1].set_xlabel("time to t_f, before the hand-over [s]")

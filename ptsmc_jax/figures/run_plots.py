@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from ptsmc_jax.figures.style import LIMIT, STYLES, figure_of, plain_ticks, shown_error, with_unit
+from ptsmc_jax.figures.style import LIMIT, STYLES, error_display, new_figure, plain_ticks, with_unit
 from ptsmc_jax.plants.base import Chart
 from ptsmc_jax.simulation.rollout import Log, Parts
 from ptsmc_jax.theory import envelopes, solutions
@@ -17,8 +17,8 @@ from ptsmc_jax.theory.lower_bound import LowerBound
 FAR_OFF = 3.0  # a limit or command beyond this multiple of the curves is only named in the legend
 SMALLEST, LARGEST = 1e-16, 1e100  # smallest error and s, and largest number, that are drawn
 MANY_POINTS = 200_000  # with more points, the search of a place for the legend takes as long as drawing
-EXACT: Any = {"color": "0.25", "lw": 0.9, "ls": (0, (1, 1.5))}  # line of the exact motion
-BOUND: Any = {"color": "0.35", "lw": 1.0, "ls": "--", "label": "bound, no noise"}
+EXACT_LINE: Any = {"color": "0.25", "lw": 0.9, "ls": (0, (1, 1.5))}  # line of the exact motion
+BOUND_LINE: Any = {"color": "0.35", "lw": 1.0, "ls": "--", "label": "bound, no noise"}
 
 
 def run_figures(parts: Parts, log: Log, limit: float | None, lower_bound: LowerBound | None) -> dict[str, Figure]:
@@ -39,102 +39,104 @@ def run_figures(parts: Parts, log: Log, limit: float | None, lower_bound: LowerB
 
 def state(parts: Parts, log: Log, chart: Chart, title: str | None = None) -> Figure:
     """Plot components of the plant's state over time, and the reference if the chart has one."""
-    figure, axes = figure_of(title or chart.title, chart.label)
-    _components(axes, log.t, parts.plant.columns(log.x)[chart.column], chart.column)
+    figure, axes = new_figure(title or chart.title, chart.label)
+    _plot_components(axes, log.t, parts.plant.columns(log.x)[chart.column], chart.column)
     if chart.with_reference:
         axes.plot(log.t, getattr(log.reference, chart.column), color="0.6", lw=1.0, zorder=1)
         axes.plot([], [], color="0.6", lw=1.0, label="reference")
-    _mark(axes, parts)
-    _legend(axes, ncols=2)
+    _mark_prescribed_time(axes, parts)
+    _add_legend(axes, ncols=2)
     return figure
 
 
 def error(parts: Parts, log: Log, lower_bound: LowerBound | None = None) -> Figure:
     """Plot the error's 2-norm on a log scale, with its upper bound, lower bound, and the window of window_error."""
     if parts.controller.kinematics.angle_unit == "rad":
-        shown, name, unit = shown_error("spacecraft")
-        figure, axes = figure_of(name.capitalize(), with_unit(name, unit))
+        convert, name, unit = error_display("spacecraft")
+        figure, axes = new_figure(name.capitalize(), with_unit(name, unit))
     else:
-        shown, (figure, axes) = np.asarray, figure_of("Error", _error_label(parts))
-    size = shown(np.linalg.norm(log.error, axis=1))
-    axes.semilogy(log.t, _positive(size), color=STYLES[0][0], label="simulated")
+        convert, (figure, axes) = np.asarray, new_figure("Error", _error_label(parts))
+    size = convert(np.linalg.norm(log.error, axis=1))
+    axes.semilogy(log.t, _zeros_to_nan(size), color=STYLES[0][0], label="simulated")
     if parts.controller.prescribed:
         before = log.t[log.t < float(parts.controller.hand_over)]
-        axes.plot(before, shown(envelopes.error_bound(parts, before)), **BOUND)
+        axes.plot(before, convert(envelopes.error_bound(parts, before)), **BOUND_LINE)
     if lower_bound is not None and lower_bound.window_error > 0.0:
-        least = shown(lower_bound.error)
-        known = (least > 0.0) & (least < size.max())  # nothing is known before the first samples
-        axes.plot(lower_bound.t[known], least[known], color=STYLES[2][0], lw=1.2, label="lower bound")
+        lower_bound_values = convert(lower_bound.error)
+        known = (lower_bound_values > 0.0) & (
+            lower_bound_values < size.max()
+        )  # nothing is known before the first samples
+        axes.plot(lower_bound.t[known], lower_bound_values[known], color=STYLES[2][0], lw=1.2, label="lower bound")
     t_f = float(parts.controller.t_f)
     axes.axvspan(t_f, t_f + float(parts.window), color="0.85", label="window of window_error")
-    _above_smallest(axes)
-    _mark(axes, parts)
-    _legend(axes)
+    _cut_axis(axes)
+    _mark_prescribed_time(axes, parts)
+    _add_legend(axes)
     return figure
 
 
 def torque(parts: Parts, log: Log, limit: float | None = None, title: str | None = None) -> Figure:
     """Plot the delivered input over time, with its largest value and the limit if there is one."""
     unit = f" {parts.plant.input_unit}".rstrip()
-    figure, axes = figure_of(title or "Control", with_unit(parts.plant.input_name, parts.plant.input_unit))
-    _components(axes, log.t, log.u, "u", drawstyle="steps-post" if parts.clock.sampled else "default")
-    reach = FAR_OFF * np.nanmax(np.abs(log.u)) or np.inf  # larger commands would flatten the curves
+    figure, axes = new_figure(title or "Control", with_unit(parts.plant.input_name, parts.plant.input_unit))
+    _plot_components(axes, log.t, log.u, "u", drawstyle="steps-post" if parts.clock.sampled else "default")
+    largest_shown = FAR_OFF * np.nanmax(np.abs(log.u)) or np.inf  # larger commands would flatten the curves
     if parts.controller.prescribed:
         t, u, _ = (np.asarray(v) for v in solutions.exact_path(parts))
-        axes.plot(t, u, **EXACT)
-        axes.plot([], [], **EXACT, label="exact, perfect estimate")
-        if np.nanmax(np.abs(u)) > reach:
-            axes.set_ylim(-reach, reach)
+        axes.plot(t, u, **EXACT_LINE)
+        axes.plot([], [], **EXACT_LINE, label="exact, perfect estimate")
+        if np.nanmax(np.abs(u)) > largest_shown:
+            axes.set_ylim(-largest_shown, largest_shown)
     row, column = np.unravel_index(np.argmax(np.nan_to_num(np.abs(log.commanded))), log.commanded.shape)
     peak = log.commanded[row, column]
     delivered = np.array_equal(log.u, log.commanded, equal_nan=True)  # otherwise the peak is not on the curves
-    of = "peak" if delivered else "peak of the command"
-    label = f"{of} {abs(peak):.3g}{unit} at {log.t[row]:.4g} s"
-    if abs(peak) > reach:
+    peak_name = "peak" if delivered else "peak of the command"
+    label = f"{peak_name} {abs(peak):.3g}{unit} at {log.t[row]:.4g} s"
+    if abs(peak) > largest_shown:
         axes.plot([], [], color="none", label=f"{label}, beyond this axis")
     else:
         axes.plot(log.t[row], peak, "o", mfc="none", color="black", label=label)
     if limit is not None:
-        _limit(axes, limit, unit)
-    _mark(axes, parts)
-    _legend(axes)
+        _draw_limit(axes, limit, unit)
+    _mark_prescribed_time(axes, parts)
+    _add_legend(axes)
     return figure
 
 
 def wheels(parts: Parts, log: Log) -> Figure:
     """Plot the momentum of the reaction wheels over time, and its limit."""
-    return _of_wheels(parts, log, 0, "Reaction wheels", "momentum", "N m s")
+    return _plot_wheels(parts, log, 0, "Reaction wheels", "momentum", "N m s")
 
 
 def wheel_torque(parts: Parts, log: Log) -> Figure:
     """Plot the torque of the reaction wheels over time, and its limit."""
-    return _of_wheels(parts, log, 1, "Torque of the reaction wheels", "torque", "N m")
+    return _plot_wheels(parts, log, 1, "Torque of the reaction wheels", "torque", "N m")
 
 
-def _of_wheels(parts: Parts, log: Log, which: int, title: str, quantity: str, unit: str) -> Figure:
+def _plot_wheels(parts: Parts, log: Log, index: int, title: str, quantity: str, unit: str) -> Figure:
     """Plot a quantity of each wheel over time, `log.wheels[which]`, with its limit, a field of `Wheels`."""
     assert log.wheels is not None
-    figure, axes = figure_of(title, f"{quantity} [{unit}]")
-    _components(axes, log.t, log.wheels[which], "hv"[which])
+    figure, axes = new_figure(title, f"{quantity} [{unit}]")
+    _plot_components(axes, log.t, log.wheels[index], "hv"[index])
     limit = getattr(parts.actuators.wheels, f"{quantity}_limit", None)
     if limit is not None:
-        _limit(axes, float(limit), f" {unit}")
-    _mark(axes, parts)
-    _legend(axes, ncols=2)
+        _draw_limit(axes, float(limit), f" {unit}")
+    _mark_prescribed_time(axes, parts)
+    _add_legend(axes, ncols=2)
     return figure
 
 
 def sliding(parts: Parts, log: Log) -> Figure:
     """Plot the sliding variable on a log scale, with its envelope before the hand-over (continuous loop, no noise)."""
-    figure, axes = figure_of("Sliding variable", with_unit("|s|", parts.controller.kinematics.error_unit))
-    _components(axes, log.t, _positive(np.abs(log.s)), "s")
+    figure, axes = new_figure("Sliding variable", with_unit("|s|", parts.controller.kinematics.error_unit))
+    _plot_components(axes, log.t, _zeros_to_nan(np.abs(log.s)), "s")
     if parts.controller.prescribed:
         before = log.t[log.t < float(parts.controller.hand_over)]
-        axes.plot(before, envelopes.sliding_bound(parts, before), **BOUND)
+        axes.plot(before, envelopes.sliding_bound(parts, before), **BOUND_LINE)
     axes.set_yscale("log")
-    _above_smallest(axes)
-    _mark(axes, parts)
-    _legend(axes)
+    _cut_axis(axes)
+    _mark_prescribed_time(axes, parts)
+    _add_legend(axes)
     return figure
 
 
@@ -143,7 +145,7 @@ def convergence(parts: Parts, log: Log, title: str = "Convergence") -> Figure:
     symbol = parts.controller.kinematics.symbol
     law, n = parts.controller, parts.controller.order
     t_f, eta, delta = float(law.t_f), float(law.eta), float(law.delta)
-    figure, axes = figure_of(title, f"{_error_label(parts)} and |s|")
+    figure, axes = new_figure(title, f"{_error_label(parts)} and |s|")
     before = log.t < float(law.hand_over) * (1 - 1e-12)
     t = np.asarray(log.t)[before]
     tau = t_f - t
@@ -155,7 +157,7 @@ def convergence(parts: Parts, log: Log, title: str = "Convergence") -> Figure:
     bottom = min(np.min(size[size > 0], initial=1.0) for size, _, _ in simulated.values())
     for (name, (size, _, (colour, style))), ideal in zip(simulated.items(), exact, strict=True):
         axes.loglog(tau, size, color=colour, ls=style, label=f"{name}, simulated")
-        axes.loglog(tau, ideal, **EXACT)
+        axes.loglog(tau, ideal, **EXACT_LINE)
     # short lines with the slopes of the theory, above the error and, if it differs, below s
     span = t_f * np.array([0.3, max(0.03, delta / t_f)])
     above = 6.0 * float(np.interp(-span[0], -tau, np.maximum(*exact)))
@@ -169,7 +171,7 @@ def convergence(parts: Parts, log: Log, title: str = "Convergence") -> Figure:
         axes.annotate(f"slope {name} = {slope:g}", (np.sqrt(span[0] * span[1]), np.sqrt(line[0] * line[1])),
                       fontsize=10, xytext=(6, shift), textcoords="offset points",
                       ha="left" if shift > 0 else "right")  # fmt: skip
-    axes.plot([], [], **EXACT, label="exact, perfect estimate")
+    axes.plot([], [], **EXACT_LINE, label="exact, perfect estimate")
     axes.set_xlabel("time to go $t_f - t$ [s]")
     axes.set_ylim(bottom=bottom / 3)
     plain_ticks(axes.xaxis)
@@ -180,15 +182,15 @@ def convergence(parts: Parts, log: Log, title: str = "Convergence") -> Figure:
 
 def disturbance(parts: Parts, log: Log) -> Figure:
     """Plot estimated and true disturbance over time; the true one on top, so that noise does not cover it."""
-    figure, axes = figure_of("Disturbance and its estimate", with_unit("disturbance", parts.plant.input_unit))
-    _components(axes, log.t, log.d_hat, "\\hat d", alpha=0.7)
+    figure, axes = new_figure("Disturbance and its estimate", with_unit("disturbance", parts.plant.input_unit))
+    _plot_components(axes, log.t, log.d_hat, "\\hat d", alpha=0.7)
     axes.plot(log.t, log.disturbance, color="white", lw=2.6, zorder=4)
     for k, true in enumerate(np.asarray(log.disturbance).T):
         axes.plot(
             log.t, true, color="black", lw=1.2, ls=STYLES[k % len(STYLES)][1], zorder=5, label=f"true $d_{{{k + 1}}}$"
         )
-    _mark(axes, parts)
-    _legend(axes, ncols=2)
+    _mark_prescribed_time(axes, parts)
+    _add_legend(axes, ncols=2)
     return figure
 
 
@@ -196,35 +198,35 @@ def _error_label(parts: Parts) -> str:
     return with_unit(parts.controller.kinematics.symbol, parts.controller.kinematics.error_unit)
 
 
-def _components(axes: Axes, t: ArrayLike, values: ArrayLike, symbol: str, **kwargs: Any) -> None:
+def _plot_components(axes: Axes, t: ArrayLike, values: ArrayLike, symbol: str, **kwargs: Any) -> None:
     values = np.asarray(values)
     for k in range(values.shape[1]):  # more components than styles: thin lines, then pale lines
         colour, style = STYLES[k % len(STYLES)]
-        turn = k // len(STYLES)
-        width = {"lw": 0.8} if turn % 2 else {}
-        paler = {"alpha": 0.45 * kwargs.get("alpha", 1.0)} if turn >= 2 else {}
+        style_cycle = k // len(STYLES)
+        width = {"lw": 0.8} if style_cycle % 2 else {}
+        paler = {"alpha": 0.45 * kwargs.get("alpha", 1.0)} if style_cycle >= 2 else {}
         label = f"${symbol}_{{{k + 1}}}$"
         axes.plot(np.asarray(t), values[:, k], color=colour, ls=style, label=label, **width, **{**kwargs, **paler})
 
 
-def _positive(sizes: np.ndarray) -> np.ndarray:
+def _zeros_to_nan(sizes: np.ndarray) -> np.ndarray:
     """Return sizes for a log axis, NaN for 0."""
     return np.where(sizes > 0.0, sizes, np.nan)
 
 
-def _above_smallest(axes: Axes) -> None:
+def _cut_axis(axes: Axes) -> None:
     """Cut the axis at `SMALLEST`."""
     low, high = axes.get_ylim()
     axes.set_ylim(bottom=SMALLEST if low < SMALLEST < high else low)
 
 
-def _legend(axes: Axes, ncols: int = 1) -> None:
+def _add_legend(axes: Axes, ncols: int = 1) -> None:
     """Add the legend where it covers the curves least; in a corner if they have too many points for the search."""
     points = sum(np.size(line.get_xdata()) for line in axes.lines)
     axes.legend(ncols=ncols, loc="best" if points < MANY_POINTS else "upper right")
 
 
-def _limit(axes: Axes, limit: float, unit: str) -> None:
+def _draw_limit(axes: Axes, limit: float, unit: str) -> None:
     """Draw lines at plus and minus a limit; only name it in the legend if it would flatten the curves."""
     largest = max((np.nanmax(np.abs(line.get_ydata()), initial=0.0) for line in axes.lines), default=0.0)
     if limit > FAR_OFF * largest > 0.0:
@@ -235,7 +237,7 @@ def _limit(axes: Axes, limit: float, unit: str) -> None:
     axes.plot([], [], **LIMIT, label=f"limit {limit:g}{unit}")
 
 
-def _mark(axes: Axes, parts: Parts) -> None:
+def _mark_prescribed_time(axes: Axes, parts: Parts) -> None:
     """Draw a line at the prescribed time."""
     t_f = float(parts.controller.t_f)
     axes.axvline(t_f, color="0.3", lw=0.9, ls=":")

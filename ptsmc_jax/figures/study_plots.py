@@ -11,8 +11,17 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from ptsmc_jax.figures.style import LIMIT, LOWER_BOUND, STYLES, figure_of, logarithmic, plain_ticks, shown_error, styled
-from ptsmc_jax.scenario.gain_bounds import wide
+from ptsmc_jax.figures.style import (
+    LIMIT,
+    LOWER_BOUND,
+    STYLES,
+    error_display,
+    logarithmic,
+    new_figure,
+    plain_ticks,
+    styled,
+)
+from ptsmc_jax.scenario.gain_bounds import is_log_scaled
 from ptsmc_jax.simulation.catalogues import CATALOGUES
 
 MARKERS = ("o", "^", "s", "D", "v")
@@ -58,7 +67,7 @@ class Sweep(NamedTuple):
     ticks: Sequence[str] | None = None  # texts at the values; None: the numbers
 
 
-def _looks(count: int) -> list[tuple[str, str]]:
+def _colours_and_markers(count: int) -> list[tuple[str, str]]:
     """Return a colour and a marker for each set, all different up to 25."""
     size = len(STYLES)
     return [(STYLES[k % size][0], MARKERS[(k + k // size) % len(MARKERS)]) for k in range(count)]
@@ -99,7 +108,7 @@ def tuning_history(
     for ax, (name, (unit, courses)) in zip(axes[1:], gains.items(), strict=True):
         ax.plot(steps, courses, color=STYLES[1][0], lw=1.0)
         ax.set_ylabel(f"{name}\n[{unit}]")
-        if wide(np.nanmin(courses), np.nanmax(courses)):
+        if is_log_scaled(np.nanmin(courses), np.nanmax(courses)):
             logarithmic(ax, "y")
     axes[-1].set_xlabel("step")
     axes[-1].xaxis.set_major_locator(matplotlib.ticker.MaxNLocator(integer=True))
@@ -129,26 +138,29 @@ def tornado(sensitivities: Mapping[str, Mapping[str, float]]) -> Figure:
 @styled
 def profiles(gains: Mapping[str, Profile], goal: str) -> Figure:
     """Plot the objective along each gain, by name; goal: name and unit of the objective."""
-    broken_limits = dict.fromkeys(of for one in gains.values() for of in np.asarray(one.nearest)[one.over > 1.0])
-    marks = {of: BEYOND[k % len(BEYOND)] for k, of in enumerate(broken_limits)}
+    broken_limits = dict.fromkeys(
+        metric for profile in gains.values() for metric in np.asarray(profile.nearest)[profile.over > 1.0]
+    )
+    marks = {metric: BEYOND[k % len(BEYOND)] for k, metric in enumerate(broken_limits)}
     legend_rows = -(-(3 + len(marks)) // 2)
     figure = Figure(figsize=(8.0, 2.7 * len(gains) + 0.26 * legend_rows), layout="constrained")
     axes = figure.subplots(len(gains), 1, sharey=True, squeeze=False)[:, 0]
-    for ax, (name, one) in zip(axes, gains.items(), strict=True):
-        ax.update_datalim(np.stack([one.gain, one.gain], axis=1), updatey=False)  # where no trial has a goal, too
-        ax.semilogy(one.gain, one.goal, color="0.6", lw=1.2, label="objective")
-        within = one.over <= 1.0
-        ax.semilogy(one.gain[within], one.goal[within], "o", color=STYLES[0][0], label="limits kept")
-        for of, mark in marks.items():
-            beyond = ~within & (np.asarray(one.nearest) == of)
-            label = f"beyond the limit of {of}"
-            ax.semilogy(one.gain[beyond], one.goal[beyond], mark, color=STYLES[1][0], label=label)
-        if not np.any(np.isfinite(one.goal)):
+    for ax, (name, profile) in zip(axes, gains.items(), strict=True):
+        points = np.stack([profile.gain, profile.gain], axis=1)
+        ax.update_datalim(points, updatey=False)  # also gains at which no trial has an objective
+        ax.semilogy(profile.gain, profile.goal, color="0.6", lw=1.2, label="objective")
+        within = profile.over <= 1.0
+        ax.semilogy(profile.gain[within], profile.goal[within], "o", color=STYLES[0][0], label="limits kept")
+        for metric, mark in marks.items():
+            beyond = ~within & (np.asarray(profile.nearest) == metric)
+            label = f"beyond the limit of {metric}"
+            ax.semilogy(profile.gain[beyond], profile.goal[beyond], mark, color=STYLES[1][0], label=label)
+        if not np.any(np.isfinite(profile.goal)):
             ax.text(0.5, 0.5, "no goal: no trial ends", transform=ax.transAxes, ha="center", va="center")
-        ax.axvline(one.tuned, color="0.3", lw=0.9, ls=":", label="tuned")
-        if wide(one.gain[0], one.gain[-1]):
+        ax.axvline(profile.tuned, color="0.3", lw=0.9, ls=":", label="tuned")
+        if is_log_scaled(profile.gain[0], profile.gain[-1]):
             logarithmic(ax, "x")
-        ax.set(xlabel=f"{name} [{one.unit}]", ylabel=goal)
+        ax.set(xlabel=f"{name} [{profile.unit}]", ylabel=goal)
     plain_ticks(axes[0].yaxis)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=2, fontsize=9)
     return figure
@@ -168,19 +180,19 @@ def tradeoff(
         kind: of the plant; it determines the units.
         lower_bound: lower bound of the RMS error.
     """
-    (shown, name, error_unit), unit = shown_error(kind), CATALOGUES[kind]["peak_torque"].unit
-    figure, axes = figure_of("Accuracy against torque, held-out trials", f"peak torque [{unit}]")
+    (convert, name, error_unit), unit = error_display(kind), CATALOGUES[kind]["peak_torque"].unit
+    figure, axes = new_figure("Accuracy against torque, held-out trials", f"peak torque [{unit}]")
     arrays = {label: (np.asarray(e), np.asarray(u)) for label, (e, u) in sets.items()}
-    looks = zip(arrays.items(), _looks(len(arrays)), range(len(arrays), 0, -1), strict=True)
+    looks = zip(arrays.items(), _colours_and_markers(len(arrays)), range(len(arrays), 0, -1), strict=True)
     for (label, (errors, torques)), (colour, marker), above in looks:  # the first set is drawn above the others
-        rms, mean = shown(np.sqrt(np.nanmean(errors**2))), np.nanmean(torques)
-        axes.loglog(shown(errors), torques, marker, ms=2.5, alpha=0.35, color=colour, mew=0, zorder=2)
+        rms, mean = convert(np.sqrt(np.nanmean(errors**2))), np.nanmean(torques)
+        axes.loglog(convert(errors), torques, marker, ms=2.5, alpha=0.35, color=colour, mew=0, zorder=2)
         text = f"{label.replace('_', ' ')}: RMS {rms:.3g} {error_unit}, mean peak {mean:.3g} {unit}"
         axes.loglog(rms, mean, marker, ms=9, color=colour, mec="white", label=text, zorder=2 + above)
     if limit is not None:
         axes.axhline(limit, **LIMIT, label=f"limit {limit:g} {unit}")
     if lower_bound:
-        least = float(shown(lower_bound))
+        least = float(convert(lower_bound))
         axes.axvline(least, **LOWER_BOUND, label=f"lower bound {least:.3g} {error_unit}")
     axes.set_xlabel(f"{name} in the window [{error_unit}]")
     for line in (axes.xaxis, axes.yaxis):
@@ -198,8 +210,8 @@ def _legend_below(figure: Figure, entries: int, columns: int) -> None:
 
 def settling_by_angle(sets: Mapping[str, tuple[np.ndarray, np.ndarray]], t_f: float) -> Figure:
     """Plot settling time against initial angle; label -> (initial angles [deg], settling times [s], NaN: never)."""
-    figure, axes = figure_of("When it settles, by where it starts", "settling time [s]")
-    for (label, (angle, time)), (colour, marker) in zip(sets.items(), _looks(len(sets)), strict=True):
+    figure, axes = new_figure("When it settles, by where it starts", "settling time [s]")
+    for (label, (angle, time)), (colour, marker) in zip(sets.items(), _colours_and_markers(len(sets)), strict=True):
         settled, name = np.isfinite(time), label.replace("_", " ")
         name = name if np.all(settled) else f"{name}: {np.count_nonzero(~settled)} never"
         axes.plot(angle[settled], time[settled], marker, ms=3.5, alpha=0.5, color=colour, mew=0, label=name)
@@ -227,27 +239,27 @@ def front(
         kind: kind of the plant, which determines the units.
         lower_bound: lower bound of the error.
     """
-    (shown, name, error_unit), unit = shown_error(kind), CATALOGUES[kind]["peak_torque"].unit
+    (convert, name, error_unit), unit = error_display(kind), CATALOGUES[kind]["peak_torque"].unit
     title = "Accuracy against torque: Pareto front, held-out trials"
-    figure, axes = figure_of(title, f"RMS {name} in the window [{error_unit}]")
+    figure, axes = new_figure(title, f"RMS {name} in the window [{error_unit}]")
     on_front, dominated = ([p for p in points if p.dominated == is_so] for is_so in (False, True))
-    axes.loglog([p.peak for p in on_front], shown([p.rms for p in on_front]), color=STYLES[0][0], lw=1.2)
+    axes.loglog([p.peak for p in on_front], convert([p.rms for p in on_front]), color=STYLES[0][0], lw=1.2)
     for group, colour, label in ((on_front, STYLES[0][0], "front"), (dominated, "0.6", "dominated")):
         for k, p in enumerate(group):
-            rms, (low, high) = shown(p.rms), shown(p.interval or (p.rms, p.rms))
+            rms, (low, high) = convert(p.rms), convert(p.interval or (p.rms, p.rms))
             axes.errorbar(p.peak, rms, [[max(rms - low, 0.0)], [max(high - rms, 0.0)]], fmt="o", ms=4,
                           color=colour, elinewidth=1.0, capsize=2, label=label if k == 0 else None)  # fmt: skip
     for p in on_front:
         if p.knee:
-            axes.loglog(p.peak, shown(p.rms), "o", ms=13, mfc="none", mec=STYLES[3][0], mew=1.4, label="knee")
+            axes.loglog(p.peak, convert(p.rms), "o", ms=13, mfc="none", mec=STYLES[3][0], mew=1.4, label="knee")
     for (label, p), marker, style in zip(others.items(), ("^", "s", "D"), STYLES[1:], strict=False):
         if np.isfinite(p.rms):
-            rms = shown(p.rms)
+            rms = convert(p.rms)
             axes.loglog(p.peak, rms, marker, ms=8, color=style[0], label=f"{label}: {rms:.3g} {error_unit}")
     if limit is not None:
         axes.axvline(limit, **LIMIT, label=f"limit {limit:g} {unit}")
     if lower_bound:
-        least = float(shown(lower_bound))
+        least = float(convert(lower_bound))
         axes.axhline(least, **LOWER_BOUND, label=f"lower bound {least:.3g} {error_unit}")
     axes.set_xlabel(f"largest peak torque [{unit}]")
     for line in (axes.xaxis, axes.yaxis):
@@ -275,12 +287,12 @@ def costs(
         axes = figure.add_subplot(-(-len(panels) // columns), columns, k + 1)
         axes.plot(sweep.values, values, "-", color=STYLES[0][0], lw=1.2)
         for met, fill, label in ((True, STYLES[0][0], "meets every requirement"), (False, "white", "does not")):
-            some = [k for k, point in enumerate(points) if point.meets == met]
-            if some:
-                x, y = ([numbers[k] for k in some] for numbers in (sweep.values, values))
+            selected = [k for k, point in enumerate(points) if point.meets == met]
+            if selected:
+                x, y = ([numbers[k] for k in selected] for numbers in (sweep.values, values))
                 axes.plot(x, y, "o", ms=5, mfc=fill, mec=STYLES[0][0], label=label)
         if not k:
-            low, high = shown_error(kind)[0]([point.interval or (point.rms, point.rms) for point in points]).T
+            low, high = error_display(kind)[0]([point.interval or (point.rms, point.rms) for point in points]).T
             axes.fill_between(sweep.values, low, high, color=STYLES[0][0], alpha=0.2, lw=0)
             axes.legend(fontsize=8)
         known = values[np.isfinite(values)]
@@ -295,9 +307,9 @@ def costs(
     return figure
 
 
-def _coloured(axes: Any, x: MapAxis, y: MapAxis, grid: np.ndarray, alike: Sequence[np.ndarray]) -> None:
-    """Draw a grid (y, x) as colours; alike: all grids with this scale."""
-    known = np.concatenate([one.ravel() for one in alike])
+def _draw_colour_map(axes: Any, x: MapAxis, y: MapAxis, grid: np.ndarray, same_scale: Sequence[np.ndarray]) -> None:
+    """Draw a grid (y, x) as colours; same_scale: all grids with this scale."""
+    known = np.concatenate([map_axis.ravel() for map_axis in same_scale])
     known = known[np.isfinite(known) & (known > 0)]
     low, high = (known.min(), min(known.max(), known.min() * WIDEST)) if known.size else (1e-12, 1.0)
     norm = matplotlib.colors.LogNorm(low, max(high, 1.01 * low))
@@ -305,8 +317,8 @@ def _coloured(axes: Any, x: MapAxis, y: MapAxis, grid: np.ndarray, alike: Sequen
         logarithmic(axes, "x")
     if y.logarithmic:
         logarithmic(axes, "y")
-    for line, one in ((axes.xaxis, x), (axes.yaxis, y)):
-        if not one.logarithmic and all(float(value).is_integer() for value in one.values):
+    for line, map_axis in ((axes.xaxis, x), (axes.yaxis, y)):
+        if not map_axis.logarithmic and all(float(value).is_integer() for value in map_axis.values):
             line.set_major_locator(matplotlib.ticker.MaxNLocator(integer=True))  # a delay is a whole number of periods
     axes.set_facecolor("0.9")  # of pairs without a number; not a colour of the map
     mesh = axes.pcolormesh(x.edges, y.edges, np.ma.masked_invalid(grid), norm=norm, cmap="cividis")
@@ -333,8 +345,8 @@ def accuracy_map(
         limit_lines: lines (x, y) by label.
         kind: of the plant; it determines the units.
     """
-    (shown, error, error_unit), unit = shown_error(kind), CATALOGUES[kind]["peak_torque"].unit
-    grids = {name: shown(grid) if "error" in name else grid for name, grid in grids.items()}
+    (convert, error, error_unit), unit = error_display(kind), CATALOGUES[kind]["peak_torque"].unit
+    grids = {name: convert(grid) if "error" in name else grid for name, grid in grids.items()}
     titles = {
         "window_error": f"RMS {error} in the window [{error_unit}]",
         "linear_window_error": f"its part from noise, linear theory [{error_unit}]",
@@ -344,11 +356,11 @@ def accuracy_map(
     drawn = [name for name in titles if np.any(np.isfinite(grids[name]))]
     rows = (len(drawn) + 1) // 2
     figure = Figure(figsize=(10.0, 4.2 * rows), layout="constrained")
-    many = np.atleast_1d(figure.subplots(rows, 2, sharex=True, sharey=True)).ravel()
+    panels = np.atleast_1d(figure.subplots(rows, 2, sharex=True, sharey=True)).ravel()
     column, row = np.meshgrid(x.values, y.values)
-    for axes, name in zip(many, drawn, strict=False):
+    for axes, name in zip(panels, drawn, strict=False):
         kind_of_number = "error" if "error" in name else "torque"  # those of a kind have one scale
-        _coloured(axes, x, y, grids[name], [grids[other] for other in drawn if kind_of_number in other])
+        _draw_colour_map(axes, x, y, grids[name], [grids[other] for other in drawn if kind_of_number in other])
         axes.plot(column[failed], row[failed], ls="", **FAILED)
         limits = axes.get_xlim(), axes.get_ylim()
         for (label, line), style in zip(limit_lines.items(), ("-", "--", ":"), strict=False):
@@ -356,13 +368,13 @@ def accuracy_map(
             axes.plot(*line, color="black", lw=1.4, ls=style, label=label)
         axes.set(xlim=limits[0], ylim=limits[1], title=titles[name])
         axes.grid(visible=False)
-    for axes in many[len(drawn) :]:
+    for axes in panels[len(drawn) :]:
         axes.remove()
-    for k, axes in enumerate(many[: len(drawn)]):  # numbers on the outer axes, below a gap too
+    for k, axes in enumerate(panels[: len(drawn)]):  # numbers on the outer axes, below a gap too
         axes.tick_params(labelbottom=k + 2 >= len(drawn), labelleft=k % 2 == 0)
     figure.supxlabel(x.label)
     figure.supylabel(y.label)
-    handles, labels = many[0].get_legend_handles_labels()
+    handles, labels = panels[0].get_legend_handles_labels()
     if np.any(failed):
         handles.append(matplotlib.lines.Line2D([], [], ls="", **FAILED))
         labels.append("a trial failed or did not converge at t_f")

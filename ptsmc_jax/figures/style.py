@@ -31,7 +31,7 @@ RC: Any = {
 styled = matplotlib.rc_context(RC)  # decorator of functions that draw in this style
 LIMIT: Any = {"color": "0.3", "lw": 1.0, "ls": (0, (6, 3))}  # line of a limit; `LOWER_BOUND`: of a lower bound
 LOWER_BOUND: Any = {"color": "0.3", "lw": 1.0, "ls": ":"}
-MANY = 1e4  # ratio of an axis's ends above which numbers between powers of ten would overlap
+WIDE_RATIO = 1e4  # ratio of an axis's ends above which numbers between powers of ten would overlap
 
 
 def save(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
@@ -43,8 +43,8 @@ def save(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
 
 
 @styled
-def figure_of(title: str, ylabel: str) -> tuple[Figure, Axes]:
-    """Return a figure with one plot over time."""
+def new_figure(title: str, ylabel: str) -> tuple[Figure, Axes]:
+    """Return a figure with one plot; its horizontal axis is labelled as time."""
     figure = Figure(figsize=(8.0, 4.5), layout="constrained")
     axes = figure.subplots()
     axes.set(xlabel=TIME, ylabel=ylabel)
@@ -62,8 +62,8 @@ class _Decades(matplotlib.ticker.LogLocator):
 
     def tick_values(self, vmin: float, vmax: float) -> Any:
         vmin, vmax = sorted((vmin, vmax))  # the axis may be inverted
-        room = MANY if self.axis is None else 10.0 ** (self.axis.get_tick_space() / self._space(vmin, vmax))
-        self.set_params(subs=(1.0,) if vmax > min(MANY, room) * vmin else (1.0, 2.0, 5.0))
+        room = WIDE_RATIO if self.axis is None else 10.0 ** (self.axis.get_tick_space() / self._space(vmin, vmax))
+        self.set_params(subs=(1.0,) if vmax > min(WIDE_RATIO, room) * vmin else (1.0, 2.0, 5.0))
         return super().tick_values(vmin, vmax)
 
     def _space(self, vmin: float, vmax: float) -> float:
@@ -74,7 +74,7 @@ class _Decades(matplotlib.ticker.LogLocator):
         return max(3.0, 0.3 + 0.7 * max(len(f"{10.0**power:g}") for power in powers))
 
 
-def shown_error(plant: str) -> tuple[Callable[[ArrayLike], np.ndarray], str, str]:
+def error_display(plant: str) -> tuple[Callable[[ArrayLike], np.ndarray], str, str]:
     """Return how figures show the error of a kind of plant: a function of its norm, its name and the unit."""
     if plant == "spacecraft":
         return lambda error: ARCSEC * pointing_angle(error), "pointing error", "arcsec"

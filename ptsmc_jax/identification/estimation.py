@@ -267,7 +267,7 @@ class Search:
         devices = min(len(configure.devices()), z.size)
         each = -(-z.size // devices)  # number of directions that each device computes
         directions = jnp.eye(devices * each, z.size).reshape(devices, each, z.size)
-        slopes, found = montecarlo.over_devices(along, directions, devices)
+        slopes, found = montecarlo.map_over_devices(along, directions, devices)
         by_value, by_variance = (jnp.concatenate([*v], axis=-1)[..., : z.size] for v in slopes)
         value, variance, accepted = (v[0] for v in found)
         by_value = by_value / jnp.sqrt(variance)[..., None]

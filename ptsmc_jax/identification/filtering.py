@@ -275,11 +275,11 @@ def _predicted(model: Model, carry: _Carry, t: Scalar, dt: Scalar, command: Arra
         state = carry.actuators._replace(queue=None)
         drive = actuators.drive(state, jnp.zeros(plant.inputs) if kind.by_channel else due, t, dt)
         drive = drive._replace(c=due) if kind.by_channel else drive
-    torque = actuators.over(drive, jnp.zeros_like(dt), dt)
+    torque = actuators.torque_over(drive, jnp.zeros_like(dt), dt)
 
     def rate(time: Scalar, y: Any, walk: Array) -> Any:
         d = model.disturbance(time, y)
-        return plant.rate(time, y, torque.at(time - t, plant.velocity(y)), d + walk if walk.size else d)
+        return plant.rate(time, y, torque.torque_at(time - t, plant.velocity(y)), d + walk if walk.size else d)
 
     after = integrators.rk4(lambda time, y: rate(time, y, carry.walk), t, carry.x, dt, rolled=True)
     after = plant.normalise(after)

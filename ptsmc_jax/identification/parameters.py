@@ -25,7 +25,7 @@ from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.plants.rigid_body import AttitudeState
 from ptsmc_jax.scenario import build as building
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
-from ptsmc_jax.scenario.parsing import nearest
+from ptsmc_jax.scenario.parsing import nearest_name_hint
 from ptsmc_jax.scenario.sensor_tables import SensorSuite
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.signals import disturbances
@@ -152,7 +152,9 @@ def build(scenario: Scenario, logs: Sequence[Measurements], names: Sequence[str]
             found.append(parameter)
         elif name != GYRO_BIAS or not has_gyro:
             known = [*catalogue, *([GYRO_BIAS] if has_gyro else [])]
-            raise ScenarioError(f"identify.free has {name}, which this scenario does not have; {nearest(name, known)}")
+            raise ScenarioError(
+                f"identify.free has {name}, which this scenario does not have; {nearest_name_hint(name, known)}"
+            )
     if not found:
         raise wrong("identify.free", names, f"a list with at least one parameter besides {GYRO_BIAS}")
     return Problem(model, found, _step(scenario, setup, interval), GYRO_BIAS in names)
@@ -168,7 +170,7 @@ def _step(scenario: Scenario, setup: Any, interval: float) -> float:
     """Return the longest integration step [s]: an interval of the log, or less for fast modes and disturbances."""
     quick = [float(np.max(np.asarray(getattr(setup.plant, "frequency", [0.0]))))]
     for term in scenario.terms:
-        quick.append(term.quickest())
+        quick.append(term.largest_frequency())
     fastest = max(quick)
     return min(interval * 1.5, 0.2 / fastest if fastest > 0.0 else np.inf)
 
@@ -271,9 +273,10 @@ def _catalogue(
     def spread(name: str, count: int) -> tuple[np.ndarray, bool]:
         """Return the 1 sigma of each number, (count,), and whether [dispersion] gives it."""
         table: Any = getattr(prior, name, None)
-        if not hasattr(table, "of"):  # no dispersion is given, or a phase is uniform over the circle
+        if not hasattr(table, "widths"):  # no dispersion is given, or a phase is uniform over the circle
             return np.full(count, usual["noise" if name.endswith("_noise") else name]), False
-        return np.maximum(table.of(count) * (1.0 if table.name.endswith("normal") else 1.0 / np.sqrt(3.0)), 1e-9), True
+        sigmas = table.widths(count) * (1.0 if table.name.endswith("normal") else 1.0 / np.sqrt(3.0))
+        return np.maximum(sigmas, 1e-9), True
 
     def field(
         name: str, path: Callable[[Model], Any], put: Callable[[Model, Array], Model], count: int, unit: str, how: str
@@ -342,7 +345,7 @@ def _catalogue(
         ("disturbance_phase", "rad", "add"),
     ):
         quantity: Any = name.removeprefix("disturbance_")
-        count = disturbances.count(model.disturbance, quantity)
+        count = disturbances.count_values(model.disturbance, quantity)
         if count:
             made[name] = field(
                 name,

@@ -22,7 +22,7 @@ def identified(found: Identification) -> Scenario:
     other quantity gets the largest 1 sigma of its numbers. Parameters that no key of a scenario holds, such as the
     numbers of a custom plant, are not in it.
     """
-    tables, at = parsing.stated(found.scenario), 0
+    tables, at = parsing.stated_tables(found.scenario), 0
     dispersion = dict(tables.get("dispersion", {}))
     for one in found.problem.parameters:
         block = slice(at, at + len(one.labels))

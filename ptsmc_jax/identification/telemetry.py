@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.numerics import csv_tables
 from ptsmc_jax.scenario.identify_tables import StateTelemetry, Telemetry
-from ptsmc_jax.scenario.parsing import nearest
+from ptsmc_jax.scenario.parsing import nearest_name_hint
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.signals import attitude_tables
 from ptsmc_jax.simulation.catalogues import UNITS
@@ -110,7 +110,7 @@ class _Table:
     def column(self, column: str) -> pl.Series:
         """Return a column. Raises RefusedError if the log does not have it."""
         if column not in self.frame.columns:
-            raise RefusedError(f"{self.name} has no column {column}; {nearest(column, self.frame.columns)}")
+            raise RefusedError(f"{self.name} has no column {column}; {nearest_name_hint(column, self.frame.columns)}")
         return self.frame[column]
 
     def numbers(self, columns: Sequence[str], unit: float = 1.0) -> Values:
@@ -255,7 +255,7 @@ def _attitude(given: Any, table: _Table, columns: Sequence[str]) -> Values:
     if given.rotation == "inertial_to_body":
         q[:, :3] *= -1.0
     there = ~np.isnan(q[:, 0])
-    q[there] = attitude_tables.continuous(q[there])
+    q[there] = attitude_tables.with_continuous_signs(q[there])
     return q
 
 

@@ -51,7 +51,7 @@ class Law(declare.Tunable):
     delta: Leaf  # time between the hand-over and t_f [s]
     tunable: ClassVar[tuple[str, ...]] = ("t_f",)  # fields that tuning may change; `gain` adds its fields
     prescribed: ClassVar[bool] = False  # whether the law is from the paper, with known exact solution and bounds
-    switches: ClassVar[bool] = True  # whether it has a switching term, sized by the bound on the estimation error
+    switches: ClassVar[bool] = True  # whether its switching term uses the bound on the estimation error
 
     @property
     def model(self) -> Any:
@@ -127,7 +127,7 @@ class Law(declare.Tunable):
         """
         return hold
 
-    # The methods below use only the numbers in the fields, because a scenario calls them with its configuration table
+    # A scenario calls the methods below with its table instead of a law. They use only the numbers in the fields.
 
     def half_turn_rate(self, t_f: float) -> tuple[str, Scalar | float]:
         """Return the field that sets how fast the law turns a body, and the largest body rate of a half turn [rad/s].

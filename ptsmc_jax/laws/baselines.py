@@ -174,8 +174,8 @@ class FixedTime(ComparisonLaw):
 
     def refusal(self, order: int) -> tuple[str, str] | None:
         """Check gamma - 1/p > 1, without which the surface is singular; see `Law.refusal`."""
-        fits = self.gamma - 1.0 / self.p > 1.0
-        return None if fits else ("gamma", f"greater than 1 + 1/p, {1.0 + 1.0 / self.p:.6g}")
+        is_nonsingular = self.gamma - 1.0 / self.p > 1.0
+        return None if is_nonsingular else ("gamma", f"greater than 1 + 1/p, {1.0 + 1.0 / self.p:.6g}")
 
 
 @pytree
@@ -208,8 +208,10 @@ class Scaling(ComparisonLaw):
         """Return a and the sliding variable z / mu [1/s], (m,) each; see `Law.acceleration`."""
         p, r = 2.0 + self.m, jnp.where(now.hold, self.delta, self.t_f - now.t)
         s = error_rate + (p / r + self.k1) * error
-        linear = 2.0 * p / r * error_rate + p * (p + 1.0) / r**2 * error + self.k1 * (error_rate + p / r * error)
-        return -linear - self.k * (self.t_f / r) ** p * s, s
+        scaled_feedback = (
+            2.0 * p / r * error_rate + p * (p + 1.0) / r**2 * error + self.k1 * (error_rate + p / r * error)
+        )
+        return -scaled_feedback - self.k * (self.t_f / r) ** p * s, s
 
     @staticmethod
     def designed(design: Any, published: Mapping[str, float]) -> Mapping[str, float]:
@@ -258,19 +260,19 @@ class PredefinedTime(ComparisonLaw):
     sign_width: Leaf = boundary_layer(Scaled(1e-2, time=-1), "1/s")
 
     def acceleration(self, now: Sample, error: Vector, error_rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
-        first, second = self.share * self.t_f, (1.0 - self.share) * self.t_f
-        surface = phi(error, self.q1, first)
+        surface_time, reaching_time = self.share * self.t_f, (1.0 - self.share) * self.t_f
+        surface = phi(error, self.q1, surface_time)
         squares = error_rate * jnp.abs(error_rate) + 2.0 * surface * jnp.abs(surface)
         s = error_rate + guards.signed_root(squares, jnp.zeros_like(bound))
-        size = jnp.abs(error)
+        magnitude = jnp.abs(error)
         # Phi_1 Phi_1' without a negative power, which would be infinite at zero. For q1 = 1/2, |x|^(1 - 2 q1) is 1.
-        power = guards.signed_power(size, 2.0 * self.q1)
-        at_zero = (size == 0.0) & (self.q1 >= 0.5)
-        quotient = size + jnp.where(at_zero, 1.0, guards.signed_power(size, 1.0 - 2.0 * self.q1))
-        factor = (jnp.pi / (2.0 * self.q1 * first)) ** 2
+        power = guards.signed_power(magnitude, 2.0 * self.q1)
+        at_zero = (magnitude == 0.0) & (self.q1 >= 0.5)
+        quotient = magnitude + jnp.where(at_zero, 1.0, guards.signed_power(magnitude, 1.0 - 2.0 * self.q1))
+        factor = (jnp.pi / (2.0 * self.q1 * surface_time)) ** 2
         phi_product = factor * ((1.0 + self.q1) * power + 1.0 - self.q1) * quotient
         switching = (bound + 2.0 * phi_product) * guards.smooth_sign(s, self.sign_width)
-        return -phi(s, self.q2, second) - switching, s
+        return -phi(s, self.q2, reaching_time) - switching, s
 
     @staticmethod
     def designed(design: Any, published: Mapping[str, float]) -> Mapping[str, float]:

@@ -261,7 +261,7 @@ class SecondOrderKinematics(Kinematics):
 
     def singularity_distance(self, x: State, target: Scalar) -> Scalar:
         """Return the determinant of dF/dx2 G, which is 0 at a singularity."""
-        jacobian, gain = self.model.slope(target, x), self.model.input_gain(target, x)
+        jacobian, gain = self.model.rate_jacobian(target, x), self.model.input_gain(target, x)
         return matrices.determinant(jacobian @ gain)
 
     def singularity_distance_unit(self, first: Scalar) -> Scalar:
@@ -278,11 +278,11 @@ class SecondOrderKinematics(Kinematics):
 
     def influence(self, x: State, target: Scalar) -> Scalar:
         """Return |dF/dx2 D|, with the Frobenius norm."""
-        return guards.norm(self.model.slope(target, x) @ self.model.disturbance_gain(target, x))
+        return guards.norm(self.model.rate_jacobian(target, x) @ self.model.disturbance_gain(target, x))
 
     def invert(self, x: State, target: Scalar, acceleration: Vector, d_hat: Vector) -> Vector:
         """Return the input (dF/dx2 G)^-1 (x_1'' - dF/dt - dF/dx1 F - dF/dx2 (H + D d_hat)), (m,)."""
-        jacobian, gain = self.model.slope(target, x), self.model.input_gain(target, x)
+        jacobian, gain = self.model.rate_jacobian(target, x), self.model.input_gain(target, x)
         without_input = self.model.drift(target, x) + self.model.disturbance_gain(target, x) @ d_hat
         return matrices.solve(
             jacobian @ gain,

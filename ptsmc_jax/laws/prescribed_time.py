@@ -96,7 +96,7 @@ class PrescribedTimeLaw(Law):
         """
         raise NotImplementedError
 
-    def layer(self, hold: Bool[Array, ""]) -> Scalar:
+    def layer_width(self, hold: Bool[Array, ""]) -> Scalar:
         """Return the thickness of the boundary layer, in the units of s in the present phase.
 
         The unit of s in the approach phase is s^(n-1) times its unit in the hold phase. The paper uses the same number
@@ -149,8 +149,8 @@ class PrescribedTimeLaw(Law):
 
         The remaining time is at least 1e-9 periods, so that powers of r and divisions by them are finite.
         """
-        left = self.time_left(now.t, now.hold)
-        return jnp.where(now.hold, 1.0, jnp.maximum(left - now.dt, 1e-9 * now.dt) / left)
+        time_left = self.time_left(now.t, now.hold)
+        return jnp.where(now.hold, 1.0, jnp.maximum(time_left - now.dt, 1e-9 * now.dt) / time_left)
 
 
 class SurfaceGains(NamedTuple):
@@ -213,7 +213,7 @@ class PrescribedTime(PrescribedTimeLaw):
         s = gains.c * error_rate + gains.e * error
         if self.implicit:
             return self._implicit_acceleration(now, error, error_rate, s, bound), s
-        switching = bound * guards.smooth_sign(s, self.layer(now.hold))
+        switching = bound * guards.smooth_sign(s, self.layer_width(now.hold))
         return -switching - gains.a * error_rate - gains.b * s, s
 
     def _implicit_acceleration(
@@ -273,7 +273,7 @@ class PrescribedTimeChain(PrescribedTimeLaw):
         if len(self.a) != order - 1:
             return "a", f"a list of plant.order - 1 = {order - 1} numbers"
         stable = "such that all roots of p^(n-1) + a_(n-1) p^(n-2) + .. + a_1 are stable (39)"
-        return None if formulas.hurwitz(self.a) else ("a", stable)
+        return None if formulas.is_hurwitz(self.a) else ("a", stable)
 
     def __call__(
         self, now: Sample, x: Float[Array, " n"], target: Any, d_hat: Vector, k2: Scalar
@@ -291,28 +291,28 @@ class PrescribedTimeChain(PrescribedTimeLaw):
             The input (1,), the sliding variable by (37) or (39) (1,), and None.
         """
         tau = self.time_left(now.t, now.hold)
-        c, a = expansion(self.eta, self.order), self.surface()
+        c, a = surface_coefficients(self.eta, self.order), self.surface()
         s = jnp.reshape(jnp.dot(_surface_weights(c, [*a, 1.0], tau, now.hold), x), 1)
         x_n_dot = self._implicit_rate(now, x, s, k2) if self.implicit else self._explicit_rate(now, x, s, k2)
         return self.kinematics.invert(x, target, x_n_dot, d_hat), s, None
 
     def _explicit_rate(self, now: Sample, x: Float[Array, " n"], s: Vector, k2: Scalar) -> Vector:
         """Return the commanded x_n' (1,) by the first case of (52) before the hand-over, else by the second."""
-        n, c, a = self.order, expansion(self.eta, self.order), self.surface()
+        n, c, a = self.order, surface_coefficients(self.eta, self.order), self.surface()
         tau = self.time_left(now.t, now.hold)
         rates = [jnp.where(now.hold, a[i], (c[i] - (i + 1) * c[i + 1]) * tau ** (i - n + 1)) for i in range(n - 1)]
         reaching = jnp.where(now.hold, self.k1, (self.eta + n - 2) / tau**n)
         equivalent = jnp.dot(jnp.stack(rates), x[1:]) + reaching * s
-        return -equivalent - k2 * guards.smooth_sign(s, self.layer(now.hold))
+        return -equivalent - k2 * guards.smooth_sign(s, self.layer_width(now.hold))
 
     def _implicit_rate(self, now: Sample, x: Float[Array, " n"], s: Vector, k2: Scalar) -> Vector:
         """Return the constant x_n' (1,) that makes s equal to `next_s` at the end: s+ = s_0 + g x_n'."""
-        n, h, c, r = self.order, now.dt, expansion(self.eta, self.order), self.remaining_fraction(now)
+        n, h, c, r = self.order, now.dt, surface_coefficients(self.eta, self.order), self.remaining_fraction(now)
         # the state at the end of the period is free + x_n' forced, by the Taylor series of a chain
         free = [sum(h ** (j - i) / math.factorial(j - i) * x[j] for j in range(i, n)) for i in range(n)]
         forced = jnp.stack([h ** (n - i) / math.factorial(n - i) for i in range(n)])
-        a, left = [*self.surface(), 1.0], self.time_left(now.t, now.hold)
-        weights_end = _surface_weights(c, a, r * left, self.in_hold(now.t, now.t + h, now.hold))
+        a, time_left = [*self.surface(), 1.0], self.time_left(now.t, now.hold)
+        weights_end = _surface_weights(c, a, r * time_left, self.in_hold(now.t, now.t + h, now.hold))
         # in the approach phase, x_1 decays like r^eta on s = 0
         at_hand_over = jnp.reshape(sum(a[i] * r ** (self.eta - i) * x[i] for i in range(n)), 1)
         s_0 = jnp.reshape(jnp.dot(weights_end, jnp.stack(free)), 1)
@@ -331,7 +331,7 @@ def _surface_weights(c: list[Scalar], a: list, tau: Scalar, hold: Bool[Array, ""
     return jnp.stack([jnp.where(hold, a[i], c[i] * tau**i) for i in range(len(c))])
 
 
-def expansion(eta: Scalar, order: int) -> list[Scalar]:
+def surface_coefficients(eta: Scalar, order: int) -> list[Scalar]:
     """Return the parameters c_0 .. c_(n-1) of (37) for order n [-].
 
     They are c_i = C(n-1, i) eta (eta+1) .. (eta+n-2-i), from the derivatives of (36). The paper does not state them.

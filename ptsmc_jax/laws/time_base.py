@@ -17,7 +17,7 @@ from ptsmc_jax.numerics import guards
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
 
 
-class Start(NamedTuple):
+class ProfileStart(NamedTuple):
     """Initial values of a profile, the memory of the law."""
 
     measured: Scalar  # whether the profile is defined: 0.0 before the first sample, then 1.0
@@ -48,12 +48,12 @@ class TimeBase(ComparisonLaw):
     control needs 4 e0/t_f^2.
     """
 
-    def begin(self) -> Start:
+    def begin(self) -> ProfileStart:
         """Return the memory before the first sample, when the profile is not defined yet."""
         zero = jnp.zeros(self.model.inputs)
-        return Start(jnp.zeros(()), zero, zero)
+        return ProfileStart(jnp.zeros(()), zero, zero)
 
-    def profile(self, start: Start, t: Scalar) -> Profile:
+    def profile(self, start: ProfileStart, t: Scalar) -> Profile:
         """Return the profile at the time t [s], for initial values `start`, with rates [1/s] and [1/s^2]."""
 
         def error(t: Scalar) -> Vector:
@@ -84,10 +84,10 @@ class TimeBase(ComparisonLaw):
 
     def acceleration(
         self, now: Sample, error: Vector, error_rate: Vector, bound: Scalar
-    ) -> tuple[Vector, Vector, Start]:
+    ) -> tuple[Vector, Vector, ProfileStart]:
         """Return a, s, (m,) each, and the initial values of the profile; see `Law.acceleration`."""
         straight, rate = jax.jvp(self.kinematics.straight_coordinates, (error,), (error_rate,))
-        start = guards.select(now.memory.measured > 0.5, now.memory, Start(jnp.ones_like(now.t), straight, rate))
+        start = guards.select(now.memory.measured > 0.5, now.memory, ProfileStart(jnp.ones_like(now.t), straight, rate))
         profile = self.profile(start, now.t)
         a, s = self.feedback(error - profile.error, error_rate - profile.rate, bound)
         return profile.acceleration + a, s, start

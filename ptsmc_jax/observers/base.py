@@ -62,10 +62,10 @@ def constant_bound(component_bound: Scalar, components: int) -> ErrorBound:
 
 @dataclass(frozen=True)
 class Observer(declare.Tunable, ABC):
-    """A disturbance observer, as the rollout asks for it."""
+    """Base class of the disturbance observers. The memory is a separate value, see `begin` and `update`."""
 
-    model: Plant  # the nominal plant
-    estimates: ClassVar[bool] = True  # False: d_hat is always 0
+    model: Plant  # design model of the plant
+    estimates: ClassVar[bool] = True  # whether d_hat can differ from 0
     linear: ClassVar[bool] = (
         False  # the estimate is linear in the measurements, and K2 is inversely proportional to the gain
     )
@@ -108,7 +108,7 @@ class Observer(declare.Tunable, ABC):
         Args:
             matrix: `update_matrix(dt)`.
             memory: memory at the start of the period.
-            impulse: integral of d_eff over the period, from `Plant.unexplained_impulse`, (m,) [N m s].
+            impulse: integral of d_eff over the period, from `Plant.implied_disturbance_impulse`, (m,) [N m s].
             t: end of the period [s].
             dt: length of the period [s], which may be 0.
         """
@@ -153,7 +153,7 @@ class SampledObserver(Observer):
 
 
 @dataclass(frozen=True)
-class Linear(Observer):
+class LinearObserver(Observer):
     """Base of the observers with a constant gain l = diag(gain)."""
 
     gain: Leaf = declare.gain(  # (m,), so that l J^-1 is in 1/s
@@ -162,7 +162,7 @@ class Linear(Observer):
                 "loop: as fast as the hold phase",
     )  # fmt: skip
     disturbance_rate_bound: Leaf  # pyright: ignore[reportGeneralTypeIssues]  # c of Assumption 1, bound on each component of d' [N m/s]
-    initial_error: Leaf  # pyright: ignore[reportGeneralTypeIssues]  # bound on |d_hat(0) - d(0)| [N m]; the paper's (57) needs it and gives none
+    initial_error: Leaf  # pyright: ignore[reportGeneralTypeIssues]  # bound on |d_hat(0) - d(0)| [N m]; (57) needs it, but the paper has no value
     linear: ClassVar[bool] = True
 
     def decay_matrix(self, t: Scalar, t_next: Scalar) -> Matrix:
@@ -172,7 +172,7 @@ class Linear(Observer):
         """Return the constant part l J^-1 of A [1/s]."""
         return self.gain[:, None] * self.model.inertia_inverse
 
-    def _bound(self) -> ErrorBound:
+    def _linear_bound(self) -> ErrorBound:
         """Return the corrected form of (55).
 
         (55) needs sqrt(m) c instead of c, because c bounds each component of d' and K2 bounds the 2-norm of the error.

@@ -39,9 +39,8 @@ class FiniteTimeBound(NamedTuple):
 class FiniteTimeObserver(Observer):
     """A super-twisting observer, exact after a finite time (Levant 1998).
 
-    Super-twisting observer on H = M w, per component (Levant, Automatica 34, 1998; order 1, full M allowed).
-
-    With e0 = z0 - H, where z0 is the estimate of H and e0(0) = 0, the equations are
+    The observer differentiates H = M w by super-twisting, component by component (Levant, Automatica 34, 1998). With
+    e0 = z0 - H, where z0 is the estimate of H and e0(0) = 0, the equations are
 
         e0' = d_hat - d - 1.5 sqrt(c) |e0|^1/2 sign(e0)
         d_hat' = -1.1 c sign(e0).
@@ -78,11 +77,11 @@ class FiniteTimeObserver(Observer):
         k = jnp.clip(self.disturbance_rate_bound / c, 0.0, 1.0)
         # linear interpolation is an upper bound, because q(k) is convex
         q = jnp.interp(k, jnp.linspace(0.0, 1.0, len(_OVERSHOOT)), jnp.asarray(_OVERSHOOT))
-        settled = (1.0 + q) / ((1.0 - q) * (1.1 - k)) * self.initial_error / c
+        settling_time = (1.0 + q) / ((1.0 - q) * (1.1 - k)) * self.initial_error / c
         ratios = jnp.clip(self.disturbance_rate_bound / self.gain, 0.0, 1.0)
         e0 = self.sign_width * jnp.arctanh(ratios / 1.1)
         e = 1.5 * jnp.sqrt(self.gain) * guards.signed_root(e0, self.sign_width)
-        return FiniteTimeBound(self.initial_error, settled, guards.norm(e))
+        return FiniteTimeBound(self.initial_error, settling_time, guards.norm(e))
 
     def decay_matrix(self, t: Scalar, t_next: Scalar) -> Matrix:
         size = 2 * self.model.inputs
@@ -106,8 +105,8 @@ class FiniteTimeObserver(Observer):
         b = e0 + dt * d_hat - impulse
         switching, half = 1.1 * self.gain * dt * dt, 0.75 * jnp.sqrt(self.gain) * dt
         xi = jnp.clip(b / jnp.where(switching > 0.0, switching, 1.0), -1.0, 1.0)
-        no_length = jnp.where(dt > 0.0, 0.0, 1.0)  # makes the derivative of the square root finite at dt = 0
-        root = jnp.sqrt(half * half + jnp.maximum(jnp.abs(b) - switching, 0.0) + no_length) - half
+        one_if_empty = jnp.where(dt > 0.0, 0.0, 1.0)  # makes the derivative of the square root finite at dt = 0
+        root = jnp.sqrt(half * half + jnp.maximum(jnp.abs(b) - switching, 0.0) + one_if_empty) - half
         e0 = jnp.where(jnp.abs(xi) < 1.0, 0.0, root * root * xi)
         return jnp.concatenate([d_hat - 1.1 * self.gain * dt * xi, e0])
 

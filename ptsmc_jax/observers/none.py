@@ -14,9 +14,8 @@ from ptsmc_jax.observers.base import ErrorBound, Matrix, Memory, Observer, const
 class NoObserver(Observer):
     """No observer: d_hat = 0, and the switching gain K must exceed the whole disturbance.
 
-    No estimate: d_hat = 0, and the switching gain must cover the disturbance itself, as in (10), (29) and (40).
-
-    K of Assumption 1 bounds each component of d. The law uses a bound on the 2-norm, so K2 = sqrt(m) K.
+    Laws (10), (29) and (40) of the paper have no observer. K of Assumption 1 bounds each component of d. The law uses a
+    bound on the 2-norm, so K2 = sqrt(m) K.
     """
 
     disturbance_bound: Leaf  # K of Assumption 1, bound on each component of d [N m]

@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 
 from ptsmc_jax.numerics.pytrees import Scalar, Vector, pytree
-from ptsmc_jax.observers.base import ErrorBound, Linear, Matrix, Memory
+from ptsmc_jax.observers.base import ErrorBound, LinearObserver, Matrix, Memory
 
 
 @pytree
 @dataclass(frozen=True)
-class NonlinearObserver(Linear):
+class NonlinearObserver(LinearObserver):
     """The paper's nonlinear disturbance observer (53), its estimate zero at t = 0.
 
     Nonlinear disturbance observer (53) with constant l(w) = diag(gain), so lambda(w) = gain w.
@@ -19,7 +19,7 @@ class NonlinearObserver(Linear):
 
     def error_bound(self) -> ErrorBound:
         """Return the corrected form of (55)."""
-        return self._bound()
+        return self._linear_bound()
 
     def forcing(self, t: Scalar, span: tuple[Scalar, Scalar], memory: Memory, d_eff: Vector) -> Memory:
         return self.gain * (self.model.inertia_inverse @ d_eff)

@@ -8,7 +8,7 @@ from jaxtyping import Array
 
 from ptsmc_jax import declare
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
-from ptsmc_jax.observers.base import ErrorBound, Linear, Matrix, Memory
+from ptsmc_jax.observers.base import ErrorBound, LinearObserver, Matrix, Memory
 
 
 class PrescribedTimeBound(NamedTuple):
@@ -48,13 +48,12 @@ class PrescribedTimeBound(NamedTuple):
 
 @pytree
 @dataclass(frozen=True)
-class PrescribedTimeObserver(Linear):
+class PrescribedTimeObserver(LinearObserver):
     """An observer that converges by t_o. Afterwards it is the nonlinear observer.
 
-    The nonlinear observer with l = diag(gain) + mu M/(T_o - t) until T_o - delta_o: its error is gone by T_o.
-
-    The error obeys e' = -(l M^-1 + mu/(T_o - t)) e - d' with l = diag(gain). So for a constant disturbance |e| decays
-    like (T_o - t)^mu. From T_o - delta_o on it is the nonlinear observer. d_hat is continuous at the change.
+    Until T_o - delta_o it is the nonlinear observer with the gain l + mu M/(T_o - t), where l = diag(gain). The error
+    obeys e' = -(l M^-1 + mu/(T_o - t)) e - d'. So for a constant disturbance |e| decays like (T_o - t)^mu. From
+    T_o - delta_o on, the gain is l. d_hat is continuous at this change.
     """
 
     mu: Leaf = declare.number(
@@ -81,7 +80,7 @@ class PrescribedTimeObserver(Linear):
         return self.mu * jnp.where(dt > 0.0, mean, 0.0)
 
     def error_bound(self) -> PrescribedTimeBound:
-        return PrescribedTimeBound(self._bound(), self.mu, self.t_o, self.delta_o)
+        return PrescribedTimeBound(self._linear_bound(), self.mu, self.t_o, self.delta_o)
 
     def decay_matrix(self, t: Scalar, t_next: Scalar) -> Matrix:
         """Return the mean of A = l J^-1 + mu/(T_o - t) over the step [1/s]."""

@@ -9,7 +9,7 @@ with a prefix:
 - `now.`: state after this sample
 - `out.`: outputs of this sample
 
-Read `board` first.
+Read `build_board` first.
 """
 
 import dataclasses
@@ -41,7 +41,7 @@ from ptsmc_jax.simulation.assembly import Parts
 ATTITUDE_IS_SET = 0.25  # |q|^2 of the quaternion in the state is larger if it has been set, and 0 before
 
 
-Given = dict[str, Any]  # values by name
+Values = dict[str, Any]  # values by name
 
 
 @dataclass(frozen=True)
@@ -49,9 +49,9 @@ class Stage:
     """A function of the flight computer."""
 
     name: str
-    about: str
+    description: str
     reads: tuple[str, ...]
-    run: Callable[[Given, Given], Given]  # (parameters, values that it reads) -> values that it writes, by name
+    run: Callable[[Values, Values], Values]  # (parameters, values that it reads) -> values that it writes, by name
     parts: tuple[Any, ...] = ()  # parts whose docstrings the C function has as a comment
 
 
@@ -66,27 +66,27 @@ class Board:
     outputs: dict[str, Any] = field(default_factory=dict)
     stages: list[Stage] = field(default_factory=list)
     rules: list[derived.Rule] = field(default_factory=list)  # rules that derive parameters from other parameters
-    about: dict[str, str] = field(default_factory=dict)  # meaning of each value, by name
-    always: tuple[str, ...] = ("period",)  # parameters that C has even if no stage reads them
+    meanings: dict[str, str] = field(default_factory=dict)  # meaning of each value, by name
+    always_exported: tuple[str, ...] = ("period",)  # parameters that C has even if no stage reads them
 
     @property
     def unit(self) -> str:
         """The unit of inputs and disturbances, in brackets."""
         return f" [{self.model.input_unit}]" if self.model.input_unit else ""
 
-    def names(self, when: str) -> tuple[str, ...]:
+    def signal_names(self, prefix: str) -> tuple[str, ...]:
         """Return the names of the measured signals with a prefix, "in", "before" or "now"."""
-        return tuple(f"{when}.{name}" for name in self.model.signals)
+        return tuple(f"{prefix}.{name}" for name in self.model.signals)
 
-    def seen(self, given: Given, when: str) -> State:
+    def measured_state(self, values: Values, prefix: str) -> State:
         """Return the measured state from values by these names."""
-        return self.model.state_of({name: given[f"{when}.{name}"] for name in self.model.signals})
+        return self.model.state_of({name: values[f"{prefix}.{name}"] for name in self.model.signals})
 
     @property
-    def parts(self) -> dict[str, str]:
+    def part_descriptions(self) -> dict[str, str]:
         """The type of each part and the values that are fixed in it, by name of the part."""
-        made = {name: part for name, part in self.parameters.items() if dataclasses.is_dataclass(part)}
-        return {name: _static_description(part) for name, part in made.items()}
+        parts = {name: part for name, part in self.parameters.items() if dataclasses.is_dataclass(part)}
+        return {name: _static_description(part) for name, part in parts.items()}
 
 
 def _static_description(part: Any) -> str:
@@ -94,16 +94,16 @@ def _static_description(part: Any) -> str:
 
     Parts inside the part are described in the same way.
     """
-    fixed = []
+    constants = []
     for entry in dataclasses.fields(part):
         value = getattr(part, entry.name)
         if entry.metadata.get("static"):
-            fixed.append(f"{entry.name}={value!r}")
+            constants.append(f"{entry.name}={value!r}")
         elif isinstance(value, tuple) and all(map(dataclasses.is_dataclass, value)):
-            fixed += [f"{entry.name}[{k}]={_static_description(one)}" for k, one in enumerate(value)]
+            constants += [f"{entry.name}[{k}]={_static_description(inner)}" for k, inner in enumerate(value)]
         elif isinstance(value, SampleTimes):
-            fixed.append(f"{entry.name}={_static_description(value)}")
-    return type(part).__qualname__ + (f"({', '.join(fixed)})" if fixed else "")
+            constants.append(f"{entry.name}={_static_description(value)}")
+    return type(part).__qualname__ + (f"({', '.join(constants)})" if constants else "")
 
 
 def real(*shape: int) -> jax.ShapeDtypeStruct:
@@ -111,15 +111,15 @@ def real(*shape: int) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(shape, jnp.result_type(float))
 
 
-def integer() -> jax.ShapeDtypeStruct:
+def flag() -> jax.ShapeDtypeStruct:
     """Return shape and dtype of a flag."""
     return jax.ShapeDtypeStruct((), jnp.int32)
 
 
-SCALARS = {"t": real, "dt": real, "regular": integer, "tracking": integer}  # scalar arguments of the C functions
+SCALARS = {"t": real, "dt": real, "regular": flag, "tracking": flag}  # scalar arguments of the C functions
 
 
-def board(parts: Parts, reference_input: bool = False) -> Board:
+def build_board(parts: Parts, reference_input: bool = False) -> Board:
     """Return the flight computer of a scenario with a sampled loop.
 
     Args:
@@ -128,55 +128,55 @@ def board(parts: Parts, reference_input: bool = False) -> Board:
     """
     observer, law = parts.observer, parts.controller
     device = parts.actuators
-    parameters, inputs = known(parts), observer.model.inputs
+    parameters, inputs = board_parameters(parts), observer.model.inputs
     computer = Board(observer.model, parameters, rules=derived.rules(parts))
-    computer.about["period"] = "control period [s]"
-    computer.about["observer_matrix"] = _summary(type(observer).update_matrix).rstrip(".")
+    computer.meanings["period"] = "control period [s]"
+    computer.meanings["observer_matrix"] = _docstring_summary(type(observer).update_matrix).rstrip(".")
     if parameters["filter"] is None:
-        _reading(computer, parts)
+        _add_sensor_stage(computer, parts)
     elif isinstance(parameters["filter"], KalmanFilter):
-        _estimating(computer, parameters["filter"])
+        _add_kalman_filter_stage(computer, parameters["filter"])
     else:
-        _filtering(computer, parts)
-    _observing(computer, observer, device)
-    _commanding(computer, law, observer, parts.command_filter)
+        _add_filter_stage(computer, parts)
+    _add_observer_stage(computer, observer, device)
+    _add_law_stage(computer, law, observer, parts.command_filter)
     computer.stages.append(Stage("begin", "Initial memory of observer, law and filters.", (), begin))
-    if not device.ideal:
-        _acting(computer, device, inputs)
+    if not device.is_ideal:
+        _add_actuator_stage(computer, device, inputs)
     return _with_reference_input(computer) if reference_input else computer
 
 
 def _with_reference_input(computer: Board) -> Board:
     """Return the flight computer with the reference as an input. Both signs of its quaternion give the same result."""
     target = jax.eval_shape(computer.parameters["reference"], real())
-    about = {"reference_q": "reference attitude", "reference_w": "its rate, in reference axes [rad/s]",
+    meanings = {"reference_q": "reference attitude", "reference_w": "its rate, in reference axes [rad/s]",
              "reference_w_dot": "time derivative of that rate [rad/s^2]"}  # fmt: skip
     computer.inputs["reference"], computer.parameters = target, {**computer.parameters}
     del computer.parameters["reference"]
-    computer.about |= about if isinstance(target, Target) else {"reference": "reference at this sample"}
+    computer.meanings |= meanings if isinstance(target, Target) else {"reference": "reference at this sample"}
     if isinstance(target, Target):
         computer.state["reference"] = real(4)
-        computer.about["reference"] = "reference attitude at the last sample"
+        computer.meanings["reference"] = "reference attitude at the last sample"
 
-    def following(stage: Stage) -> Stage:
-        def run(parameters: Given, given: Given) -> Given:
-            target = given["in.reference"]
+    def with_input(stage: Stage) -> Stage:
+        def run_stage(parameters: Values, values: Values) -> Values:
+            target = values["in.reference"]
             if isinstance(target, Target):
                 q = attitude.unit(target.q)
-                target = target._replace(q=jnp.where(jnp.dot(q, given["before.reference"]) < 0.0, -q, q))
-            written = stage.run({**parameters, "reference": lambda t: target}, given)
-            kept = stage.name == "sense" and isinstance(target, Target)
-            return written | ({"now.reference": target.q} if kept else {})
+                target = target._replace(q=jnp.where(jnp.dot(q, values["before.reference"]) < 0.0, -q, q))
+            results = stage.run({**parameters, "reference": lambda t: target}, values)
+            keeps_reference = stage.name == "sense" and isinstance(target, Target)
+            return results | ({"now.reference": target.q} if keeps_reference else {})
 
         reads = ("in.reference", *(("before.reference",) if isinstance(target, Target) else ()))
-        return dataclasses.replace(stage, reads=(*stage.reads, *reads), run=run)
+        return dataclasses.replace(stage, reads=(*stage.reads, *reads), run=run_stage)
 
-    computer.stages = [following(stage) if stage.name in ("sense", "command") else stage for stage in computer.stages]
+    computer.stages = [with_input(stage) if stage.name in ("sense", "command") else stage for stage in computer.stages]
     return computer
 
 
-def known(parts: Parts) -> dict[str, Any]:
-    """Return all parameters of the flight computer by name [SI units], as known on board: not the true plant's."""
+def board_parameters(parts: Parts) -> dict[str, Any]:
+    """Return the parameters of the flight computer by name [SI units]. They belong to the design model."""
     observer, sensors, period = parts.observer, parts.sensors, parts.period
     parameters = {
         "law": parts.controller,
@@ -199,45 +199,48 @@ def known(parts: Parts) -> dict[str, Any]:
     return parameters
 
 
-def _summary(documented: Any) -> str:
+def _docstring_summary(documented: Any) -> str:
     return " ".join((documented.__doc__ or "").strip().split("\n\n")[0].split())
 
 
-def _continued(parameters: Given, given: Given, x: State, before: State) -> State:
-    """Return the state in one of its equivalent forms, such as the sign of q.
+def _nearest_form(parameters: Values, values: Values, x: State, before: State) -> State:
+    """Return the equivalent form of a state, such as q or -q, that is nearest to the state at the last sample.
 
-    The form is the nearest to the state at the last sample. At the first sample it is `Kinematics.align`.
+    At the first sample it is the form of `Kinematics.align`.
     """
-    law, target = parameters["law"], parameters["reference"](given["t"])
-    near, first = law.model.nearest(x, before), law.kinematics.align(x, target)
-    return jax.tree.map(lambda *forms: jnp.where(given["tracking"] != 0, *forms), near, first)
+    law, target = parameters["law"], parameters["reference"](values["t"])
+    nearest, aligned = law.model.nearest_representation(x, before), law.kinematics.align(x, target)
+    return jax.tree.map(lambda *forms: jnp.where(values["tracking"] != 0, *forms), nearest, aligned)
 
 
-def _reading(computer: Board, parts: Parts) -> None:
-    """Add a stage that reads sensors without a filter."""
+def _add_sensor_stage(computer: Board, parts: Parts) -> None:
+    """Add the stage that reads the measured state directly, without an attitude filter."""
     model = computer.model
     signals = jax.eval_shape(model.signals_of, parts.plant.visible(parts.initial))
     computer.inputs |= signals
     computer.state |= signals
-    computer.about |= model.signals
+    computer.meanings |= model.signals
 
-    def sense(parameters: Given, given: Given) -> Given:
-        x = _continued(parameters, given, model.accepted(computer.seen(given, "in")), computer.seen(given, "before"))
+    def sense(parameters: Values, values: Values) -> Values:
+        before = computer.measured_state(values, "before")
+        x = _nearest_form(
+            parameters, values, model.normalise_measurement(computer.measured_state(values, "in")), before
+        )
         return {f"now.{name}": value for name, value in model.signals_of(x).items()}
 
-    reads = ("tracking", "t", *computer.names("in"), *computer.names("before"))
+    reads = ("tracking", "t", *computer.signal_names("in"), *computer.signal_names("before"))
     computer.stages.append(Stage("sense", "The measured state, which the law uses without a filter.", reads, sense))
 
 
-def _filtering(computer: Board, parts: Parts) -> None:
+def _add_filter_stage(computer: Board, parts: Parts) -> None:
     """Add the stage of the attitude filter with constant gains, from star tracker and gyro."""
     sensors: Any = parts.sensors
-    aged = sensors.own_times is not None  # the star tracker has its own clock
-    computer.parameters["filter_bandwidth"] = derived.bandwidth(sensors, parts.period)  # a number of few digits
-    age = {"attitude_age": real()} if aged else {}
-    computer.inputs |= {"attitude": real(4), "attitude_valid": integer(), **age, "rate": real(3)}
+    has_age = sensors.own_times is not None  # the star tracker has its own clock
+    computer.parameters["filter_bandwidth"] = derived.shortest_filter_bandwidth(sensors, parts.period)
+    age = {"attitude_age": real()} if has_age else {}
+    computer.inputs |= {"attitude": real(4), "attitude_valid": flag(), **age, "rate": real(3)}
     computer.state |= {"attitude": real(4), "rate": real(3), "bias": real(3), "gyro": real(3)}
-    computer.about |= computer.model.signals | {
+    computer.meanings |= computer.model.signals | {
         "attitude_valid": "whether the star tracker has an attitude at this sample: 0 or 1",
         "attitude_age": "age of this attitude at the sample, at most the time since the last sample [s]",
         "bias": "estimated gyro bias [rad/s]",
@@ -246,53 +249,53 @@ def _filtering(computer: Board, parts: Parts) -> None:
         "star_tracker_interval": "time between two samples of the star tracker [s]",
     }
 
-    def sense(parameters: Given, given: Given) -> Given:
-        attitude_filter, dt, one = parameters["filter"], given["dt"], jnp.ones_like(given["dt"])
-        before, gyro, gyro_before = given["before.attitude"], given["in.rate"], given["before.gyro"]
-        valid = given["in.attitude_valid"] != 0
-        measured = attitude.unit(jnp.where(valid, given["in.attitude"], before))  # an invalid input is not used
+    def sense(parameters: Values, values: Values) -> Values:
+        attitude_filter, dt, one = parameters["filter"], values["dt"], jnp.ones_like(values["dt"])
+        before, gyro, gyro_before = values["before.attitude"], values["in.rate"], values["before.gyro"]
+        valid = values["in.attitude_valid"] != 0
+        measured = attitude.unit(jnp.where(valid, values["in.attitude"], before))  # an invalid input is not used
         start = jnp.where(jnp.dot(before, before) > ATTITUDE_IS_SET, before, measured)
-        old = Estimate(start, given["before.bias"])
-        if aged:
+        last_estimate = Estimate(start, values["before.bias"])
+        if has_age:
             estimate = jax.lax.cond(
                 valid,
                 lambda age: attitude_filter.correct_between(
-                    old, gyro_before, gyro, dt, measured, jnp.clip(age, 0.0, dt), one
+                    last_estimate, gyro_before, gyro, dt, measured, jnp.clip(age, 0.0, dt), one
                 ),
-                lambda _: attitude_filter.propagate(old, gyro_before, gyro, dt),
-                given["in.attitude_age"],
+                lambda _: attitude_filter.propagate(last_estimate, gyro_before, gyro, dt),
+                values["in.attitude_age"],
             )
         else:
-            ahead = attitude_filter.propagate(old, gyro_before, gyro, dt)
+            ahead = attitude_filter.propagate(last_estimate, gyro_before, gyro, dt)
             estimate = jax.lax.cond(valid, lambda: attitude_filter.correct(ahead, measured, one), lambda: ahead)
         rate = gyro - estimate.bias
-        x = _continued(parameters, given, AttitudeState(estimate.q, rate), AttitudeState(start, rate))
+        x = _nearest_form(parameters, values, AttitudeState(estimate.q, rate), AttitudeState(start, rate))
         return {"now.attitude": x.q, "now.rate": rate, "now.bias": estimate.bias, "now.gyro": gyro}
 
-    about = "Attitude filter: propagates the attitude with the gyro and corrects it with the star tracker."
+    summary = "Attitude filter: propagates the attitude with the gyro and corrects it with the star tracker."
     reads = ("in.attitude", "in.attitude_valid", "in.rate", "before.attitude", "before.bias", "before.gyro", "dt",
              "tracking", "t", *(("in.attitude_age",) if age else ()))  # fmt: skip
-    computer.stages.append(Stage("sense", about, reads, sense, (sensors.filter,)))
+    computer.stages.append(Stage("sense", summary, reads, sense, (sensors.filter,)))
 
 
-def _estimating(computer: Board, estimator: KalmanFilter) -> None:
+def _add_kalman_filter_stage(computer: Board, estimator: KalmanFilter) -> None:
     """Add the stage of the attitude Kalman filter, from a gyro and attitude sensors."""
     computer.inputs["rate"] = real(3)
-    computer.about["rate"] = computer.model.signals["rate"]
+    computer.meanings["rate"] = computer.model.signals["rate"]
     for sensor in estimator.sensors:
-        name, forward = sensor.name, jnp.array([0.0, 0.0, 0.0, 1.0])
-        computer.inputs |= {name: jax.eval_shape(sensor.read, forward), f"{name}_valid": integer()}
-        computer.about[name] = _summary(type(sensor))
-        computer.about[f"{name}_valid"] = f"whether {name} has a reading at this sample: 0 or 1"
+        name, identity = sensor.name, jnp.array([0.0, 0.0, 0.0, 1.0])
+        computer.inputs |= {name: jax.eval_shape(sensor.read, identity), f"{name}_valid": flag()}
+        computer.meanings[name] = _docstring_summary(type(sensor))
+        computer.meanings[f"{name}_valid"] = f"whether {name} has a reading at this sample: 0 or 1"
         if sensor.times.every is None:
             computer.inputs[f"{name}_age"] = real()
-            computer.about[f"{name}_age"] = f"age of the reading of {name} at the sample [s]"
-    past, size = estimator.past, 9 + 3 * estimator.past
+            computer.meanings[f"{name}_age"] = f"age of the reading of {name} at the sample [s]"
+    past_count, state_size = estimator.past_samples, 9 + 3 * estimator.past_samples
     computer.state |= {"attitude": real(4), "rate": real(3), "bias": real(3), "gyro": real(3)}
-    computer.state |= {"past_attitude": real(past, 4)} if past else {}
-    computer.state |= {"past_rate": real(past, 3)} if estimator.between else {}
-    computer.state["covariance"] = real(size, size)
-    computer.about |= {
+    computer.state |= {"past_attitude": real(past_count, 4)} if past_count else {}
+    computer.state |= {"past_rate": real(past_count, 3)} if estimator.has_readings_between_samples else {}
+    computer.state["covariance"] = real(state_size, state_size)
+    computer.meanings |= {
         "bias": "estimated gyro bias [rad/s]",
         "gyro": "rate that the gyro measured at the last sample, minus its estimated noise [rad/s]",
         "past_attitude": "estimated attitudes at the last samples, the newest first",
@@ -303,30 +306,32 @@ def _estimating(computer: Board, estimator: KalmanFilter) -> None:
     states = [name for name in computer.state if name != "rate"]
     reads = (*(f"in.{name}" for name in computer.inputs), *(f"before.{name}" for name in states), "dt", "tracking", "t")
 
-    def sense(parameters: Given, given: Given) -> Given:
-        known, before, one = parameters["filter"], given["before.attitude"], jnp.ones_like(given["dt"])
+    def sense(parameters: Values, values: Values) -> Values:
+        estimator, before, one = parameters["filter"], values["before.attitude"], jnp.ones_like(values["dt"])
         start, readings = before, []
-        for sensor in known.sensors:  # before the attitude is known, use the reading of a star tracker
-            valid = given[f"in.{sensor.name}_valid"] != 0
-            reading = jnp.where(valid, given[f"in.{sensor.name}"], sensor.read(start))
+        for sensor in estimator.sensors:  # before the attitude is known, use the reading of a star tracker
+            valid = values[f"in.{sensor.name}_valid"] != 0
+            reading = jnp.where(valid, values[f"in.{sensor.name}"], sensor.read(start))
             if isinstance(sensor, StarTracker):
                 reading = attitude.unit(reading)
-                unknown = valid & (jnp.dot(start, start) <= ATTITUDE_IS_SET)
-                start = jnp.where(unknown, sensor.body(reading), start)
+                is_unknown = valid & (jnp.dot(start, start) <= ATTITUDE_IS_SET)
+                start = jnp.where(is_unknown, sensor.body(reading), start)
             readings.append((valid, reading))
-        past = given.get("before.past_attitude")
+        past = values.get("before.past_attitude")
         if past is not None:
             past = jax.vmap(lambda q: jnp.where(jnp.dot(q, q) > ATTITUDE_IS_SET, q, start))(past)
         covariance = jax.lax.cond(
-            jnp.dot(before, before) > ATTITUDE_IS_SET, lambda: given["before.covariance"], lambda: known.unknown()
+            jnp.dot(before, before) > ATTITUDE_IS_SET,
+            lambda: values["before.covariance"],
+            lambda: estimator.covariance_at_switch_on(),
         )
-        estimates = (given["before.bias"], given["before.gyro"], past, given.get("before.past_rate"))
-        track = known.propagate(Track(start, *estimates, covariance), given["in.rate"], given["dt"])
-        for k, (sensor, (valid, reading)) in enumerate(zip(known.sensors, readings, strict=True)):
-            age = given.get(f"in.{sensor.name}_age", sensor.times.wait * known.period)
-            corrected = partial(known.correct, track, k, reading, age, one)
+        estimates = (values["before.bias"], values["before.gyro"], past, values.get("before.past_rate"))
+        track = estimator.propagate(Track(start, *estimates, covariance), values["in.rate"], values["dt"])
+        for k, (sensor, (valid, reading)) in enumerate(zip(estimator.sensors, readings, strict=True)):
+            age = values.get(f"in.{sensor.name}_age", sensor.times.wait * estimator.period)
+            corrected = partial(estimator.correct, track, k, reading, age, one)
             track = jax.lax.cond(valid, corrected, lambda track=track: track)
-        x = _continued(parameters, given, AttitudeState(track.q, track.w), AttitudeState(start, track.w))
+        x = _nearest_form(parameters, values, AttitudeState(track.q, track.w), AttitudeState(start, track.w))
         now = {
             "attitude": x.q,
             "rate": track.w,
@@ -338,169 +343,173 @@ def _estimating(computer: Board, estimator: KalmanFilter) -> None:
         }
         return {f"now.{name}": value for name, value in now.items() if value is not None}
 
-    about = "Attitude Kalman filter: propagates the attitude with the gyro and corrects it with the attitude sensors."
-    computer.stages.append(Stage("sense", about, reads, sense, (estimator,)))
+    summary = "Attitude Kalman filter: propagates the attitude with the gyro and corrects it with the attitude sensors."
+    computer.stages.append(Stage("sense", summary, reads, sense, (estimator,)))
 
 
-def _observing(computer: Board, observer: Observer, device: Actuators) -> None:
+def _add_observer_stage(computer: Board, observer: Observer, device: Actuators) -> None:
     """Add a stage that estimates the disturbance from the motion in the last period."""
     m, wheels = observer.model.inputs, device.wheels
     computer.state["observer"] = jax.eval_shape(observer.begin)
     computer.outputs["d_hat"] = real(m)
-    computer.about |= {"observer": "memory of the observer; the first numbers are the estimate",
+    computer.meanings |= {"observer": "memory of the observer; the first numbers are the estimate",
                    "d_hat": f"estimated disturbance{computer.unit}"}  # fmt: skip
-    measured = {}  # wheel telemetry that determines the torque over the next period
+    telemetry_shapes = {}  # wheel telemetry that determines the torque over the next period
     if wheels is not None:
-        each = real(*np.shape(wheels.initial))
-        computer.about["wheel_momentum"] = (
+        per_wheel = real(*np.shape(wheels.initial))
+        computer.meanings["wheel_momentum"] = (
             "absolute momentum of each wheel: spin inertia times (wheel speed + axis . body rate) [N m s]"
         )
-        measured = {"wheel_momentum": each, **({"acting": each} if device.moves else {})}
-        computer.inputs |= measured
-        computer.state |= measured
-        acted = "last.wheel_torque"
-    elif device.moves:
+        telemetry_shapes = {"wheel_momentum": per_wheel, **({"acting": per_wheel} if device.has_dynamics else {})}
+        computer.inputs |= telemetry_shapes
+        computer.state |= telemetry_shapes
+        torque_name = "last.wheel_torque"
+    elif device.has_dynamics:
         computer.inputs["applied"] = real(m)
-        computer.about["applied"] = "mean torque on the body over the last period, from telemetry [N m]"
-        acted = "in.applied"
+        computer.meanings["applied"] = "mean torque on the body over the last period, from telemetry [N m]"
+        torque_name = "in.applied"
     else:
-        acted = "last.command" if device.ideal else "last.torque"
+        torque_name = "last.command" if device.is_ideal else "last.torque"
 
-    def observe(parameters: Given, given: Given) -> Given:
-        known, t, dt, memory = parameters["observer"], given["t"], given["dt"], given["before.observer"]
-        model, before, now = known.model, computer.seen(given, "before"), computer.seen(given, "now")
+    def observe(parameters: Values, values: Values) -> Values:
+        observer, t, dt, memory = parameters["observer"], values["t"], values["dt"], values["before.observer"]
+        model = observer.model
+        before, now = computer.measured_state(values, "before"), computer.measured_state(values, "now")
 
-        def updated() -> Any:
-            applied = given[acted]
-            if measured:
-                drive = Drive(given.get("before.acting"), applied, given["before.wheel_momentum"], jnp.zeros((), bool))
-                torque, stored = parameters["actuators"].assumed(drive, dt)
-                turning = (model.velocity(before) + model.velocity(now)) / 2
-                applied = torque - jnp.cross(turning, stored)
-            impulse = model.unexplained_impulse(t, before, now, applied, dt)
-            return known.update(parameters["observer_matrix"], memory, impulse, t, dt)
+        def update_observer() -> Any:
+            applied = values[torque_name]
+            if telemetry_shapes:
+                momentum, limited = values["before.wheel_momentum"], jnp.zeros((), bool)
+                drive = Drive(values.get("before.acting"), applied, momentum, limited)
+                torque, wheel_momentum = parameters["actuators"].assumed_torque(drive, dt)
+                mean_rate = (model.velocity(before) + model.velocity(now)) / 2
+                applied = torque - jnp.cross(mean_rate, wheel_momentum)
+            impulse = model.implied_disturbance_impulse(t, before, now, applied, dt)
+            return observer.update(parameters["observer_matrix"], memory, impulse, t, dt)
 
-        memory = jax.lax.cond(given["regular"] != 0, updated, lambda: memory)
-        written = {"now.observer": memory, "out.d_hat": known.estimate(memory)}
-        return written | {f"now.{name}": given[f"in.{name}"] for name in measured}
+        memory = jax.lax.cond(values["regular"] != 0, update_observer, lambda: memory)
+        results = {"now.observer": memory, "out.d_hat": observer.estimate(memory)}
+        return results | {f"now.{name}": values[f"in.{name}"] for name in telemetry_shapes}
 
-    telemetry = [f"{when}.{name}" for when in ("before", "in") for name in measured]
-    states = (*computer.names("before"), *computer.names("now"))
-    reads = ("t", "dt", "regular", "before.observer", *states, acted, *telemetry)
-    about = "Disturbance observer: estimates the disturbance from the motion since the last sample."
-    computer.stages.append(Stage("observe", about, reads, observe, (observer,)))
+    telemetry_reads = [f"{prefix}.{name}" for prefix in ("before", "in") for name in telemetry_shapes]
+    states = (*computer.signal_names("before"), *computer.signal_names("now"))
+    reads = ("t", "dt", "regular", "before.observer", *states, torque_name, *telemetry_reads)
+    summary = "Disturbance observer: estimates the disturbance from the motion since the last sample."
+    computer.stages.append(Stage("observe", summary, reads, observe, (observer,)))
 
 
-def _commanding(computer: Board, law: Law, observer: Observer, command_filter: CommandFilter | None) -> None:
+def _add_law_stage(computer: Board, law: Law, observer: Observer, command_filter: CommandFilter | None) -> None:
     """Add a stage that evaluates the law, before and after its hand-over, and filters its command."""
     m, memory = observer.model.inputs, law.begin()
     x = computer.model.state_of(computer.state)
     target = jax.eval_shape(computer.parameters["reference"], real())
 
-    def once(law: Law, x: Any, target: Any) -> Any:
+    def evaluate_once(law: Law, x: Any, target: Any) -> Any:
         now = Sample(jnp.zeros(()), jnp.zeros((), bool), jnp.ones(()), memory)
         return law(now, x, target, jnp.zeros(m), jnp.zeros(()))[1]
 
     computer.state["law"] = jax.eval_shape(law.begin)
-    computer.outputs |= {"command": real(m), "s": real(*jax.eval_shape(once, law, x, target).shape)}
-    filtered = "" if command_filter is None else ", after the command filter"
-    computer.about |= {
+    computer.outputs |= {"command": real(m), "s": real(*jax.eval_shape(evaluate_once, law, x, target).shape)}
+    filter_note = "" if command_filter is None else ", after the command filter"
+    computer.meanings |= {
         "law": "memory of the law",
-        "command": f"command of the law{filtered}{computer.unit}",
+        "command": f"command of the law{filter_note}{computer.unit}",
         "s": "sliding variable",
     }
-    memories, shaped = ["law"], ()
+    memories, filter_parts = ["law"], ()
     if command_filter is not None:
         computer.state["command_filter"] = jax.eval_shape(lambda: command_filter.begin(m))
-        computer.about["command_filter"] = "states of the command filter, half a period ahead"
-        memories, shaped = ["law", "command_filter"], (command_filter,)
+        computer.meanings["command_filter"] = "states of the command filter, half a period ahead"
+        memories, filter_parts = ["law", "command_filter"], (command_filter,)
     traced = jax.make_jaxpr(law.singularity_distance)(x, target)
-    singular = any(dependence(traced.jaxpr, [True] * len(traced.jaxpr.invars)))  # whether the distance can vary
-    if singular:
+    can_be_singular = any(dependence(traced.jaxpr, [True] * len(traced.jaxpr.invars)))  # whether the distance can vary
+    if can_be_singular:
         computer.state |= {"singularity_distance": real(), "singularity_distance_unit": real()}
-        computer.about |= {"singularity_distance": "distance to the law's singularity, divided by its unit [-]",
+        computer.meanings |= {"singularity_distance": "distance to the law's singularity, divided by its unit [-]",
                            "singularity_distance_unit": "unit of singularity_distance"}  # fmt: skip
 
-    reads = ("t", "tracking", "out.d_hat", *(f"before.{name}" for name in memories), *computer.names("now"),
-             *(("dt",) if shaped else ()),
-             *(("before.singularity_distance_unit", "last.command", "last.s") if singular else ()))  # fmt: skip
+    reads = ("t", "tracking", "out.d_hat", *(f"before.{name}" for name in memories), *computer.signal_names("now"),
+             *(("dt",) if filter_parts else ()),
+             *(("before.singularity_distance_unit", "last.command", "last.s") if can_be_singular else ()))  # fmt: skip
 
-    def command(parameters: Given, given: Given) -> Given:
-        known, period, t = parameters["law"], parameters["period"], given["t"]
-        last = {name: given[f"before.{name}"] for name in memories}
-        now, reference = computer.seen(given, "now"), parameters["reference"](t)
-        hold = t >= known.hand_over - guards.time_tolerance(period, known.hand_over)  # the tolerance of `clock.Flight`
+    def command(parameters: Values, values: Values) -> Values:
+        law, period, t = parameters["law"], parameters["period"], values["t"]
+        memory_before = {name: values[f"before.{name}"] for name in memories}
+        now, reference = computer.measured_state(values, "now"), parameters["reference"](t)
+        hold = t >= law.hand_over - guards.time_tolerance(period, law.hand_over)  # the tolerance of `clock.Flight`
 
-        def decided() -> tuple[Any, Any, dict[str, Any]]:
-            sample, d_hat, k2 = Sample(t, hold, period, last["law"]), given["out.d_hat"], parameters["bound"](t)
-            u, s, law = known(sample, now, reference, d_hat, k2)
+        def evaluate_law() -> tuple[Any, Any, dict[str, Any]]:
+            sample, k2 = Sample(t, hold, period, memory_before["law"]), parameters["bound"](t)
+            u, s, law_memory = law(sample, now, reference, values["out.d_hat"], k2)
             u, s = (jnp.asarray(v, jnp.result_type(float)) for v in (u, s))  # a custom law may return integers
             if command_filter is None:
-                return u, s, {"law": law}
-            before = jnp.where(given["dt"] > 0.0, period, 0.0)  # a whole period, even after missed samples
-            u, integrators = parameters["command_filter"].step(last["command_filter"], u, before, period)
-            return u, s, {"law": law, "command_filter": integrators}
+                return u, s, {"law": law_memory}
+            elapsed = jnp.where(values["dt"] > 0.0, period, 0.0)  # a whole period, even after missed samples
+            u, integrators = parameters["command_filter"].step(memory_before["command_filter"], u, elapsed, period)
+            return u, s, {"law": law_memory, "command_filter": integrators}
 
-        if singular:
-            distance = known.singularity_distance(now, reference)
+        if can_be_singular:
+            distance = law.singularity_distance(now, reference)
             unit = jnp.where(
-                given["tracking"] != 0,
-                given["before.singularity_distance_unit"],
-                known.kinematics.singularity_distance_unit(distance),
+                values["tracking"] != 0,
+                values["before.singularity_distance_unit"],
+                law.kinematics.singularity_distance_unit(distance),
             )
-            singularity_distance, stays = distance / unit, (given["last.command"], given["last.s"], last)
-            u, s, kept = jax.lax.cond(singularity_distance >= run_state.SINGULAR_DISTANCE, decided, lambda: stays)
-            kept |= {"singularity_distance": singularity_distance, "singularity_distance_unit": unit}
+            singularity_distance, last = distance / unit, (values["last.command"], values["last.s"], memory_before)
+            u, s, memory_after = jax.lax.cond(
+                singularity_distance >= run_state.SINGULAR_DISTANCE, evaluate_law, lambda: last
+            )
+            memory_after |= {"singularity_distance": singularity_distance, "singularity_distance_unit": unit}
         else:
-            u, s, kept = decided()
-        return {"out.command": u, "out.s": s} | {f"now.{name}": value for name, value in kept.items()}
+            u, s, memory_after = evaluate_law()
+        return {"out.command": u, "out.s": s} | {f"now.{name}": value for name, value in memory_after.items()}
 
-    about = f"Control law: the command for the measured state{filtered}; the last command if the law is singular."
-    computer.stages.append(Stage("command", about, reads, command, (law, law.kinematics, *shaped)))
+    summary = f"Control law: the command for the measured state{filter_note}; the last command if the law is singular."
+    computer.stages.append(Stage("command", summary, reads, command, (law, law.kinematics, *filter_parts)))
 
 
-def begin(parameters: Given, given: Given) -> Given:
+def begin(parameters: Values, values: Values) -> Values:
     """Return the memory before the first sample."""
-    filtering, m = parameters["command_filter"], parameters["observer"].model.inputs
-    begun = {} if filtering is None else {"now.command_filter": filtering.begin(m)}
+    command_filter, m = parameters["command_filter"], parameters["observer"].model.inputs
+    memories = {} if command_filter is None else {"now.command_filter": command_filter.begin(m)}
     estimator = parameters["filter"]
     if isinstance(estimator, KalmanFilter):
-        begun["now.covariance"] = estimator.covariance(estimator.first[0])
-    return {"now.observer": parameters["observer"].begin(), "now.law": parameters["law"].begin(), **begun}
+        memories["now.covariance"] = estimator.covariance(estimator.first[0])
+    return {"now.observer": parameters["observer"].begin(), "now.law": parameters["law"].begin(), **memories}
 
 
-def _acting(computer: Board, device: Actuators, m: int) -> None:
+def _add_actuator_stage(computer: Board, device: Actuators, m: int) -> None:
     """Add a stage that models the actuators: delay, limits, allocation to wheels."""
     wheels, reads = device.wheels, ["out.command"]
     if device.delay:
         computer.state["queue"] = real(device.delay, m)
-        computer.about["queue"] = "delayed commands, the oldest first [N m]"
+        computer.meanings["queue"] = "delayed commands, the oldest first [N m]"
         reads.append("before.queue")
-    if device.moves:
+    if device.has_dynamics:
         computer.inputs.setdefault("acting", real(m))
-        computer.about["acting"] = "torque of each axis or wheel at this sample, from telemetry [N m]"
+        computer.meanings["acting"] = "torque of each axis or wheel at this sample, from telemetry [N m]"
         reads.append("in.acting")
-    compensated = "" if wheels is None else ", plus the compensation of the wheels' momentum"
+    compensation_note = "" if wheels is None else ", plus the compensation of the wheels' momentum"
     computer.outputs |= {"sent_torque": real(m), "torque": real(m)}
-    computer.about["sent_torque"] = (
-        f"torque to send to the actuators at this sample: `command` within its limit{compensated}{computer.unit}"
+    computer.meanings["sent_torque"] = (
+        f"torque to send to the actuators at this sample: `command` within its limit{compensation_note}{computer.unit}"
     )
-    computer.about["torque"] = "torque on the body from this sample on, as the flight computer assumes it [N m]"
+    computer.meanings["torque"] = "torque on the body from this sample on, as the flight computer assumes it [N m]"
     if wheels is not None:
         computer.outputs["wheel_torque"] = real(*np.shape(wheels.initial))
-        computer.about["wheel_torque"] = "torque of each wheel on the body about its axis, from this sample on [N m]"
+        computer.meanings["wheel_torque"] = "torque of each wheel on the body about its axis, from this sample on [N m]"
         reads += ["in.wheel_momentum", "now.rate"]
 
-    def act(parameters: Given, given: Given) -> Given:
-        actuators, u = parameters["actuators"], given["out.command"]
-        state = ActuatorState(given.get("before.queue"), given.get("in.acting"), given.get("in.wheel_momentum"))
-        rate = given.get("now.rate", jnp.zeros_like(u))
+    def act(parameters: Values, values: Values) -> Values:
+        actuators, u = parameters["actuators"], values["out.command"]
+        state = ActuatorState(values.get("before.queue"), values.get("in.acting"), values.get("in.wheel_momentum"))
+        rate = values.get("now.rate", jnp.zeros_like(u))
         drive, queue = actuators.command(state, u, rate, jnp.zeros(()), parameters["period"], jnp.ones(()))
-        written = {"limited": drive.limited, "out.sent_torque": actuators.send(state, u, rate)[0]}
-        written |= {} if queue is None else {"now.queue": queue}
+        results = {"limited": drive.limited, "out.sent_torque": actuators.send(state, u, rate)[0]}
+        results |= {} if queue is None else {"now.queue": queue}
         if wheels is None:
-            return {**written, "out.torque": drive.c}
-        return {**written, "out.torque": actuators.wheels.axes @ drive.c, "out.wheel_torque": drive.c}
+            return {**results, "out.torque": drive.c}
+        return {**results, "out.torque": actuators.wheels.axes @ drive.c, "out.wheel_torque": drive.c}
 
-    what = "Actuators: limits, delay, allocation to wheels."
-    computer.stages.append(Stage("act", what, tuple(reads), act, (device,)))
+    summary = "Actuators: limits, delay, allocation to wheels."
+    computer.stages.append(Stage("act", summary, tuple(reads), act, (device,)))

@@ -17,67 +17,67 @@ from ptsmc_jax.devices.kalman_filter import KalmanFilter
 from ptsmc_jax.numerics import matrices
 from ptsmc_jax.simulation.assembly import Parts
 
-Given = dict[str, Any]  # the parameters, see `board.board`
-Rule = Callable[[Given], Given]  # maps all parameters to all parameters, with the derived ones recomputed
+Values = dict[str, Any]  # the parameters by name, see `board.board_parameters`
+Rule = Callable[[Values], Values]  # maps all parameters to all parameters, with the derived ones recomputed
 
 
 def rules(parts: Parts) -> list[Rule]:
     """Return the rules for the flight computer of these parts; each uses the result of the rule before it."""
-    found: list[Rule] = [_inertia_inverses, _estimation]
+    rules_in_order: list[Rule] = [_derive_inertia_inverses, _derive_observer_values]
     estimator = getattr(parts.sensors, "filter", None)
     if isinstance(estimator, KalmanFilter):
-        found.append(_copied_periods)
+        rules_in_order.append(_copy_period)
     elif estimator is not None:
-        found.append(_filtering(parts.sensors))
+        rules_in_order.append(_filter_gain_rule(parts.sensors))
     if parts.actuators.wheels is not None:
-        found.append(_wheel_allocation)
-    return found
+        rules_in_order.append(_derive_wheel_allocation)
+    return rules_in_order
 
 
-def _inverse(model: Any) -> Any:
+def _with_inertia_inverse(model: Any) -> Any:
     """Return a plant model with the inverse of its inertia, if it has such a field."""
     if all(field.name != "inertia_inverse" for field in fields(model)):
         return model
     return replace(model, inertia_inverse=matrices.solve(model.inertia, jnp.eye(model.inputs)))
 
 
-def _inertia_inverses(given: Given) -> Given:
-    law, observer = given["law"], given["observer"]
-    law = replace(law, kinematics=replace(law.kinematics, model=_inverse(law.model)))
-    return given | {"law": law, "observer": replace(observer, model=_inverse(observer.model))}
+def _derive_inertia_inverses(values: Values) -> Values:
+    law, observer = values["law"], values["observer"]
+    law = replace(law, kinematics=replace(law.kinematics, model=_with_inertia_inverse(law.model)))
+    return values | {"law": law, "observer": replace(observer, model=_with_inertia_inverse(observer.model))}
 
 
-def _estimation(given: Given) -> Given:
+def _derive_observer_values(values: Values) -> Values:
     """Derive the observer's matrix for a period, and K2, the bound on the observer's error."""
-    observer = given["observer"]
-    return given | {"observer_matrix": observer.update_matrix(given["period"]), "bound": observer.error_bound()}
+    observer = values["observer"]
+    return values | {"observer_matrix": observer.update_matrix(values["period"]), "bound": observer.error_bound()}
 
 
-def _copied_periods(given: Given) -> Given:
+def _copy_period(values: Values) -> Values:
     """Copy the control period into the Kalman filter and its sensors."""
-    estimator, period = given["filter"], given["period"]
+    estimator, period = values["filter"], values["period"]
     sensors = (replace(sensor, times=replace(sensor.times, period=period)) for sensor in estimator.sensors)
-    return given | {"filter": replace(estimator, sensors=tuple(sensors), period=period)}
+    return values | {"filter": replace(estimator, sensors=tuple(sensors), period=period)}
 
 
-def _filtering(sensors: Any) -> Rule:
-    every = sensors.every
+def _filter_gain_rule(sensors: Any) -> Rule:
+    samples_per_reading = sensors.every
 
-    def run(given: Given) -> Given:
+    def derive_filter_gains(values: Values) -> Values:
         """Compute the gains of `attitude_filter.filter_gains`, with `expm1` for accuracy in single precision."""
-        interval = given.get("star_tracker_interval", given["period"] * every)
-        gone = -jnp.expm1(-given["filter_bandwidth"] * interval)  # 1 - p with the pole p of the filter
-        known = replace(given["filter"], attitude_gain=gone * (2.0 - gone), bias_gain=gone**2 / interval)
-        return given | {"filter": known}
+        interval = values.get("star_tracker_interval", values["period"] * samples_per_reading)
+        decay = -jnp.expm1(-values["filter_bandwidth"] * interval)  # 1 - p with the pole p of the filter
+        estimator = replace(values["filter"], attitude_gain=decay * (2.0 - decay), bias_gain=decay**2 / interval)
+        return values | {"filter": estimator}
 
-    return run
-
-
-def _wheel_allocation(given: Given) -> Given:
-    return given | {"actuators": allocated(given["actuators"])}
+    return derive_filter_gains
 
 
-def allocated(device: Actuators) -> Actuators:
+def _derive_wheel_allocation(values: Values) -> Values:
+    return values | {"actuators": with_wheel_allocation(values["actuators"])}
+
+
+def with_wheel_allocation(device: Actuators) -> Actuators:
     """Return actuators with the pseudo-inverse of the wheels' axes, A' (A A')^-1, which span all directions."""
     if device.wheels is None:
         return device
@@ -86,13 +86,13 @@ def allocated(device: Actuators) -> Actuators:
     return replace(device, wheels=replace(device.wheels, allocation=allocation))
 
 
-def bandwidth(sensors: Any, period: Any) -> np.ndarray:
+def shortest_filter_bandwidth(sensors: Any, period: Any) -> np.ndarray:
     """Return the bandwidth of the sensors' attitude filter [rad/s], as the shortest number that gives its gains."""
-    exact = float(sensors.bandwidth(period))
+    exact_bandwidth = float(sensors.bandwidth(period))
     interval = float(period) * sensors.every if sensors.own_times is None else float(sensors.own_times.interval)
     gain = float(sensors.filter.attitude_gain)
     for digits in range(3, 17):
-        short = float(f"{exact:.{digits}g}")
-        if abs(float(filter_gains(short, interval)[0]) - gain) < 1e-15:
-            return np.asarray(short)
-    return np.asarray(exact)
+        rounded_bandwidth = float(f"{exact_bandwidth:.{digits}g}")
+        if abs(float(filter_gains(rounded_bandwidth, interval)[0]) - gain) < 1e-15:
+            return np.asarray(rounded_bandwidth)
+    return np.asarray(exact_bandwidth)

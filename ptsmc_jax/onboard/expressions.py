@@ -10,7 +10,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-PASSING = ("neg", "abs", "max", "min", "sign", "sin", "cos", "tanh", "atan", "select")  # finite for finite operands
+# operations whose result is finite if their operands are
+FINITE_OPERATIONS = ("neg", "abs", "max", "min", "sign", "sin", "cos", "tanh", "atan", "select")
 REAL, BOOL = "real", "bool"  # kinds of numbers; the other kinds are C's integer types, such as "int32_t"
 TYPES = "bool, float32, float64, int8 to int64 or uint8 to uint32"  # dtypes that have a kind
 
@@ -20,7 +21,7 @@ class NoRuleError(ValueError):
 
 
 class Title:
-    """The name of a value in the source; a node is one of its components."""
+    """The name of a value in the Python source. The nodes of the components of this value share it."""
 
     def __init__(self, name: str):
         self.name = name
@@ -29,16 +30,16 @@ class Title:
 class Node:
     """A scalar: an operation and its operands, a constant, or a place in memory."""
 
-    __slots__ = ("args", "block", "finite", "kind", "op", "part", "section", "serial", "title", "value")
-    made: ClassVar[int] = 0
+    __slots__ = ("args", "block", "finite", "indices", "kind", "op", "section", "serial", "title", "value")
+    created: ClassVar[int] = 0
 
     def __init__(self, op: str, args: tuple["Node", ...], kind: str, value: Any, block: "Block"):
-        Node.made += 1
-        self.serial = Node.made  # number of creation: operands have smaller numbers
+        Node.created += 1
+        self.serial = Node.created  # in the order of creation: operands have smaller numbers
         self.op, self.args, self.kind, self.value, self.block = op, args, kind, value, block
         self.finite = self._is_finite()
         self.title: Title | None = None  # name of the value in the source
-        self.part = ""  # indices of the component within this value
+        self.indices = ""  # indices of the component within this value
         self.section: Any = None  # function of the source that computes the value
 
     def _is_finite(self) -> bool:
@@ -52,8 +53,8 @@ class Node:
             return math.isfinite(self.value)
         if self.op == "place":
             return not self.value.startswith("d->")  # derived numbers may overflow
-        known = self.op in PASSING or (self.op == "convert" and self.args[0].kind != REAL)
-        return known and all(arg.finite for arg in self.args)
+        keeps_finite = self.op in FINITE_OPERATIONS or (self.op == "convert" and self.args[0].kind != REAL)
+        return keeps_finite and all(arg.finite for arg in self.args)
 
 
 class Block:
@@ -61,14 +62,14 @@ class Block:
 
     def __init__(self, outer: "Block | None" = None):
         self.outer, self.nodes = outer, []
-        self.known: dict[Any, Node] = {}
+        self.nodes_by_key: dict[Any, Node] = {}
 
     def find(self, key: Any) -> Node | None:
-        """Return the node with this key, from here or an enclosing block."""
+        """Return the node with this key in this block or an enclosing block, or None."""
         block: Block | None = self
         while block is not None:
-            if key in block.known:
-                return block.known[key]
+            if key in block.nodes_by_key:
+                return block.nodes_by_key[key]
             block = block.outer
         return None
 
@@ -90,7 +91,7 @@ class Region:
 
 
 # functions that evaluate an operation on constants, by operation
-FOLDED: dict[str, Callable] = {
+EVALUATORS: dict[str, Callable] = {
     "add": lambda a, b: a + b,
     "sub": lambda a, b: a - b,
     "mul": lambda a, b: a * b,
@@ -140,14 +141,14 @@ class Pool:
         value = bool(value) if kind == BOOL else float(value) if kind == REAL else int(value)
         # distinguish 0.0 and -0.0, which are equal; find nan, which is not equal to itself
         key = ("constant", kind, math.copysign(1.0, value) if value == 0 else 0, "nan" if value != value else value)
-        return self.block.find(key) or self._put(key, Node("constant", (), kind, value, self._outermost()))
+        return self.block.find(key) or self._store(key, Node("constant", (), kind, value, self._outermost_block()))
 
     def place(self, name: str, kind: str) -> Node:
         """Return the node of a place in memory."""
         key = ("place", name)
-        return self.block.find(key) or self._put(key, Node("place", (), kind, name, self._outermost()))
+        return self.block.find(key) or self._store(key, Node("place", (), kind, name, self._outermost_block()))
 
-    def fresh(self, kind: str, op: str = "variable") -> Node:
+    def new_variable(self, kind: str, op: str = "variable") -> Node:
         """Return a new variable, index or table of a loop or a branch.
 
         Args:
@@ -158,14 +159,14 @@ class Pool:
         node.section = self.section
         return node
 
-    def _outermost(self) -> Block:
+    def _outermost_block(self) -> Block:
         block = self.block
         while block.outer is not None:
             block = block.outer
         return block
 
-    def _put(self, key: Any, node: Node) -> Node:
-        node.block.known[key] = node
+    def _store(self, key: Any, node: Node) -> Node:
+        node.block.nodes_by_key[key] = node
         return node
 
     def make(self, op: str, *args: Node, kind: str = REAL, value: Any = None) -> Node:
@@ -177,62 +178,62 @@ class Pool:
             kind: kind of the result.
             value: further data of the operation, if any.
         """
-        simple = self._simplified(op, args, kind)
-        if simple is not None:
-            return simple
+        simplified = self._simplify(op, args, kind)
+        if simplified is not None:
+            return simplified
         ordered = tuple(sorted(args, key=id)) if op in ("add", "mul", "and", "or", "eq", "ne") else args
         key = (op, kind, value, *map(id, ordered))
-        found = self.block.find(key)
-        if found is not None:
-            return found
+        existing = self.block.find(key)
+        if existing is not None:
+            return existing
         node = Node(op, args, kind, value, self.block)
         node.section = self.section
         self.block.nodes.append(node)
-        return self._put(key, node)
+        return self._store(key, node)
 
-    def _simplified(self, op: str, args: Sequence[Node], kind: str) -> Node | None:
-        known = [a.op == "constant" for a in args]
-        if all(known) and op in FOLDED:
-            value = FOLDED[op](*(a.value for a in args))
+    def _simplify(self, op: str, args: Sequence[Node], kind: str) -> Node | None:
+        is_constant = [a.op == "constant" for a in args]
+        if all(is_constant) and op in EVALUATORS:
+            value = EVALUATORS[op](*(a.value for a in args))
             if kind != REAL or math.isfinite(value):
                 return self.constant(value, kind)
         if op == "select":
             test, yes, no = args
-            if known[0]:
+            if is_constant[0]:
                 return yes if test.value else no
             return yes if yes is no else None
-        if op in ("lt", "ge") and known[1] and args[0].kind.startswith("u") and args[1].value == 0:
+        if op in ("lt", "ge") and is_constant[1] and args[0].kind.startswith("u") and args[1].value == 0:
             return self.constant(op == "ge", BOOL)  # compilers warn about comparisons that are always true or false
-        if not any(known):
+        if not any(is_constant):
             return args[0].args[0] if op in ("neg", "not") and args[0].op == op else None
         if op in ("add", "sub", "mul", "div") and len(args) == 2:
-            return self._arithmetic(op, args[0], args[1], kind)
+            return self._simplify_arithmetic(op, args[0], args[1], kind)
         if op in ("and", "or"):
-            fixed, other = (args[0], args[1]) if known[0] else (args[1], args[0])
-            return other if fixed.value == (op == "and") else fixed
+            constant, other = (args[0], args[1]) if is_constant[0] else (args[1], args[0])
+            return other if constant.value == (op == "and") else constant
         return None
 
-    def _arithmetic(self, op: str, a: Node, b: Node, kind: str) -> Node | None:
-        def holds(node: Node, value: float) -> bool:
+    def _simplify_arithmetic(self, op: str, a: Node, b: Node, kind: str) -> Node | None:
+        def is_constant(node: Node, value: float) -> bool:
             return node.op == "constant" and node.value == value
 
-        if op == "add" and (holds(a, 0) or holds(b, 0)):
-            return b if holds(a, 0) else a
+        if op == "add" and (is_constant(a, 0) or is_constant(b, 0)):
+            return b if is_constant(a, 0) else a
         if op == "sub":
-            if holds(b, 0):
+            if is_constant(b, 0):
                 return a
-            if holds(a, 0):
+            if is_constant(a, 0):
                 return self.make("neg", b, kind=kind)
         if op == "mul":
-            half, other = (a, b) if a.op == "constant" else (b, a)
-            if holds(half, 0.5) and other.op == "add" and other.args[0] is other.args[1]:
+            factor, other = (a, b) if a.op == "constant" else (b, a)
+            if is_constant(factor, 0.5) and other.op == "add" and other.args[0] is other.args[1]:
                 return other.args[0]  # half of a + a is exactly a
-            if (holds(a, 0) and b.finite) or (holds(b, 0) and a.finite):
+            if (is_constant(a, 0) and b.finite) or (is_constant(b, 0) and a.finite):
                 return self.constant(0, kind)
-            if holds(a, 1) or holds(b, 1):
-                return b if holds(a, 1) else a
-            if holds(a, -1) or holds(b, -1):
-                return self.make("neg", b if holds(a, -1) else a, kind=kind)
-        if op == "div" and holds(b, 1):
+            if is_constant(a, 1) or is_constant(b, 1):
+                return b if is_constant(a, 1) else a
+            if is_constant(a, -1) or is_constant(b, -1):
+                return self.make("neg", b if is_constant(a, -1) else a, kind=kind)
+        if op == "div" and is_constant(b, 1):
             return a
         return None

@@ -10,7 +10,7 @@ import numpy as np
 
 from ptsmc_jax.batching.components import object_array
 from ptsmc_jax.onboard.expressions import TYPES, NoRuleError, Pool, kind_of
-from ptsmc_jax.onboard.origins import comments
+from ptsmc_jax.onboard.origins import field_comments
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Field:
     name: str
     shape: tuple[int, ...]
     kind: str
-    about: str = ""
+    meaning: str = ""
 
     @property
     def size(self) -> int:
@@ -31,22 +31,22 @@ class Field:
         """Return the names of its elements in C, row by row."""
         return [self.name + "".join(f"[{i}]" for i in index) for index in np.ndindex(*self.shape)]
 
-    def nodes(self, pool: Pool, owner: str) -> np.ndarray:
+    def nodes(self, pool: Pool, prefix: str) -> np.ndarray:
         """Return the elements as an array of nodes.
 
         Args:
             pool: makes the nodes.
-            owner: the text before the name in C, such as "in->".
+            prefix: the text before the name in C, such as "in->".
         """
-        return object_array(self.shape, (pool.place(owner + element, self.kind) for element in self.elements()))
+        return object_array(self.shape, (pool.place(prefix + element, self.kind) for element in self.elements()))
 
 
-def struct(trees: Mapping[str, Any], about: Mapping[str, str]) -> dict[str, list[Field]]:
+def struct_fields(trees: Mapping[str, Any], meanings: Mapping[str, str]) -> dict[str, list[Field]]:
     """Return the fields of a struct, in order.
 
     Args:
         trees: pytrees of shapes and dtypes, by name.
-        about: the meaning of trees that are a single leaf, by name.
+        meanings: the meaning of trees that are a single leaf, by name.
 
     Returns:
         A field for each leaf, by the name of the tree.
@@ -54,41 +54,42 @@ def struct(trees: Mapping[str, Any], about: Mapping[str, str]) -> dict[str, list
     Raises:
         NoRuleError: the dtype of a leaf has no C type.
     """
-    found: dict[str, list[Field]] = {}
-    taken: set[str] = set()
+    fields: dict[str, list[Field]] = {}
+    used_names: set[str] = set()
     for name, tree in trees.items():
-        found[name] = []
+        fields[name] = []
         for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
-            parts, meaning = names_and_comment(path, tree)
-            full = re.sub(r"\W+", "_", "_".join([name, *parts])).strip("_").lower() or "x"
-            while full in taken:  # keys of a memory may differ only in capitals or punctuation
-                full += "_"
-            taken.add(full)
+            parts, meaning = path_names_and_meaning(path, tree)
+            full_name = re.sub(r"\W+", "_", "_".join([name, *parts])).strip("_").lower() or "x"
+            while full_name in used_names:  # keys of a memory may differ only in capitals or punctuation
+                full_name += "_"
+            used_names.add(full_name)
             try:
                 kind = kind_of(leaf.dtype)
             except KeyError:
-                raise NoRuleError(f"{full} has the type {leaf.dtype}, but must have the type {TYPES}") from None
-            found[name].append(Field(full, tuple(leaf.shape), kind, meaning or ("" if path else about.get(name, ""))))
-    return found
+                raise NoRuleError(f"{full_name} has the type {leaf.dtype}, but must have the type {TYPES}") from None
+            meaning = meaning or ("" if path else meanings.get(name, ""))
+            fields[name].append(Field(full_name, tuple(leaf.shape), kind, meaning))
+    return fields
 
 
-def names_and_comment(path: Any, tree: Any) -> tuple[list[str], str]:
-    """Return the attributes that lead to a leaf, and the comment beside its field in the source."""
-    names, meaning, at = [], "", tree
+def path_names_and_meaning(path: Any, tree: Any) -> tuple[list[str], str]:
+    """Return the names of the attributes that lead to a leaf, and its meaning from the source."""
+    names, meaning, owner = [], "", tree
     for key in path:
         attribute = getattr(key, "name", None)
-        if attribute is not None and not isinstance(at, dict):
-            meaning = declared_of(at, attribute) or comments(type(at)).get(attribute, "")
+        if attribute is not None and not isinstance(owner, dict):
+            meaning = declared_meaning(owner, attribute) or field_comments(type(owner)).get(attribute, "")
             names.append(attribute)
-            at = getattr(at, attribute)
+            owner = getattr(owner, attribute)
         else:
-            what = getattr(key, "key", getattr(key, "idx", key))
-            names.append(str(what))
-            at = _within(at, what)
+            entry = getattr(key, "key", getattr(key, "idx", key))
+            names.append(str(entry))
+            owner = _child(owner, entry)
     return names, meaning
 
 
-def declared_of(part: Any, name: str) -> str:
+def declared_meaning(part: Any, name: str) -> str:
     """Return meaning, unit and allowed values of a field of a part, empty if its class does not declare them."""
     field = getattr(type(part), "__dataclass_fields__", {}).get(name)
     declared = None if field is None else field.metadata.get("declared")
@@ -99,9 +100,9 @@ def declared_of(part: Any, name: str) -> str:
     return f"{meaning}: {declared.words}"
 
 
-def _within(at: Any, what: Any) -> Any:
+def _child(tree: Any, entry: Any) -> Any:
     try:
-        return at[what]
+        return tree[entry]
     except (TypeError, KeyError, IndexError):
-        leaves = jax.tree.leaves(at, is_leaf=lambda node: node is not at)
-        return leaves[what] if isinstance(what, int) and what < len(leaves) else None
+        leaves = jax.tree.leaves(tree, is_leaf=lambda node: node is not tree)
+        return leaves[entry] if isinstance(entry, int) and entry < len(leaves) else None

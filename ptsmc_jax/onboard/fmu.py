@@ -1,4 +1,7 @@
-"""Functional mock-up units (FMI 2.0 and 3.0, co-simulation) of an exported controller or plant. Read `write` first."""
+"""Functional mock-up units (FMI 2.0 and 3.0, co-simulation) of an exported controller or plant.
+
+Read `write_fmu` first.
+"""
 
 import hashlib
 import math
@@ -18,14 +21,21 @@ from ptsmc_jax.onboard import templates
 from ptsmc_jax.onboard.expressions import REAL
 from ptsmc_jax.onboard.fields import Field
 from ptsmc_jax.onboard.generate import Code
-from ptsmc_jax.onboard.library import build
-from ptsmc_jax.onboard.templates import STATUS, About
+from ptsmc_jax.onboard.library import compile_library
+from ptsmc_jax.onboard.templates import STATUS, ExportInfo
 from ptsmc_jax.scenario.errors import ScenarioError
 
 VERSIONS = (2, 3)
 TYPES = {2: {"r": "Real", "i": "Integer", "u": "Integer"}, 3: {"r": "Float64", "i": "Int32", "u": "UInt32"}}
 # exponents of the base units in each unit that a description may contain
-UNITS = {"rad": {"rad": 1}, "s": {"s": 1}, "m": {"m": 1}, "kg": {"kg": 1}, "N": {"kg": 1, "m": 1, "s": -2}, "1": {}}
+BASE_UNITS = {
+    "rad": {"rad": 1},
+    "s": {"s": 1},
+    "m": {"m": 1},
+    "kg": {"kg": 1},
+    "N": {"kg": 1, "m": 1, "s": -2},
+    "1": {},
+}
 # parts of the state that a user may set before the first sample
 FILTER_STATE = ("attitude", "bias", "gyro", "past_attitude", "past_rate")
 
@@ -44,20 +54,20 @@ class Variable(NamedTuple):
     kind: str  # "r" real, "i" integer or "u" unsigned integer
     role: str  # "i" input, "o" output, "f" fixed parameter, "t" tunable parameter or "c" constant
     start: float
-    about: str
+    meaning: str
 
     @property
     def unit(self) -> Unit | None:
-        """The unit in brackets in `about`, or None if there is no or more than one unit."""
-        found = re.findall(r"\[([^\]]+)\]", self.about)
-        return unit(found[0]) if len(found) == 1 and self.kind == "r" else None
+        """The unit in brackets in `meaning`, or None if there is no or more than one unit."""
+        units = re.findall(r"\[([^\]]+)\]", self.meaning)
+        return parse_unit(units[0]) if len(units) == 1 and self.kind == "r" else None
 
 
 class Model(NamedTuple):
     """A program in C as the model of an FMU."""
 
     code: Code
-    about: About  # properties; `name` is the name of the C files
+    info: ExportInfo  # properties; `name` is the name of the C files
     title: str  # such as "controller of first_flight.toml"
     texts: dict[str, str]  # text of each C file, by file name
     t_end: float  # end of the run [s]
@@ -70,51 +80,52 @@ class Model(NamedTuple):
         return float(self.code.values["period"])
 
 
-def unit(text: str) -> Unit | None:
+def parse_unit(text: str) -> Unit | None:
     """Return the unit of a text such as "N m/s^2", or None if it is not a product of integer powers of known units."""
     exponents, names = dict[str, int](), list[str]()
     for k, part in enumerate(text.split("/")):
-        for token in part.split():
-            found = re.fullmatch(r"([A-Za-z]+|1)(?:\^(\d+))?", token)
-            if found is None or found[1] not in UNITS:
+        for factor in part.split():
+            match = re.fullmatch(r"([A-Za-z]+|1)(?:\^(\d+))?", factor)
+            if match is None or match[1] not in BASE_UNITS:
                 return None
-            power = int(found[2] or 1)
-            for base, exponent in UNITS[found[1]].items():
+            power = int(match[2] or 1)
+            for base, exponent in BASE_UNITS[match[1]].items():
                 exponents[base] = exponents.get(base, 0) + (-1 if k else 1) * exponent * power
         names.append(".".join(part.replace("^", "").split()))
     return Unit("/".join(names), {base: power for base, power in exponents.items() if power})
 
 
-def variables(model: Model) -> list[Variable]:
+def list_variables(model: Model) -> list[Variable]:
     """Return the variables of an FMU in the order of their value references."""
     code = model.code
 
-    def listed(fields: Iterable[Field], role: str, values: dict[str, Any], prefix: str = "") -> Iterable[Variable]:
+    def make(fields: Iterable[Field], role: str, values: dict[str, Any], prefix: str = "") -> Iterable[Variable]:
         for field in fields:
             kind = {REAL: "r", "uint32_t": "u"}.get(field.kind, "i")
             start = np.broadcast_to(values.get(field.name, _default_start(field)), field.shape)
             for index in np.ndindex(*field.shape):
-                at = f"[{','.join(str(k + 1) for k in index)}]" if index else ""
-                yield Variable(f"{prefix}{field.name}{at}", kind, role, float(start[index]), _meaning(field.about))
+                suffix = f"[{','.join(str(k + 1) for k in index)}]" if index else ""
+                name = f"{prefix}{field.name}{suffix}"
+                yield Variable(name, kind, role, float(start[index]), _short_meaning(field.meaning))
 
     statuses = ", ".join(f"{k} {name.lower()}" for k, name in enumerate(STATUS))
-    taken = {field.name for field in (*code.inputs, *code.outputs)}
+    used_names = {field.name for field in (*code.inputs, *code.outputs)}
     zeros = {field.name: 0.0 for field in (*model.filter_state, *code.outputs)}
-    fixed, of_period = ("f", "c") if model.plant else ("t", "f")
+    role, period_role = ("f", "c") if model.plant else ("t", "f")
     return [
-        *listed(code.inputs, "i", {}),
-        *listed(code.outputs, "o", zeros),
+        *make(code.inputs, "i", {}),
+        *make(code.outputs, "o", zeros),
         Variable("status", "i", "o", 0.0, f"status of the last sample: {statuses}"),
-        *listed(model.filter_state, "f", zeros, "initial_"),
-        *(made for field in code.parameters
-          for made in listed([field], of_period if field.name == "period" else fixed, code.values,
-                             "nominal_" if field.name in taken else "")),
+        *make(model.filter_state, "f", zeros, "initial_"),
+        *(variable for field in code.parameters
+          for variable in make([field], period_role if field.name == "period" else role, code.values,
+                             "nominal_" if field.name in used_names else "")),
     ]  # fmt: skip
 
 
-def _meaning(about: str) -> str:
+def _short_meaning(comment: str) -> str:
     """Return the meaning of a field without its shape and its default value in a scenario."""
-    text = re.sub(r"^\([^)]*,[^)]*\)\s*", "", " ".join(about.split()))
+    text = re.sub(r"^\([^)]*,[^)]*\)\s*", "", " ".join(comment.split()))
     return re.sub(r"; default: [^[]*(?=\[)", " ", text)
 
 
@@ -123,96 +134,98 @@ def _default_start(field: Field) -> Any:
     return [0.0, 0.0, 0.0, 1.0] if field.shape == (4,) and "wheel" not in field.name else 0.0
 
 
-def sources(model: Model, version: int) -> tuple[dict[str, str], str]:
+def source_texts(model: Model, version: int) -> tuple[dict[str, str], str]:
     """Return the C files of an FMU (texts by file name) and its instantiation token, a checksum of the files."""
-    code, listed = model.code, variables(model)
-    rows = templates.rows(code, model.about)
+    code, listed = model.code, list_variables(model)
+    row_texts = templates.row_values(code, model.info)
     elements = [element for field in model.filter_state for element in field.elements()]
     lines = [f"    m->state.{element} = (ptsmc_real)m->v[FIRST_START + {k}];" for k, element in enumerate(elements)]
-    first = len(listed) - len(code.columns["params"])
+    first_parameter = len(listed) - len(code.columns["params"])
     values = {
-        "name": model.about.name,
+        "name": model.info.name,
         "inputs": len(code.columns["in"]) - 1,
         "outputs": len(code.columns["out"]),
         "parameters": len(code.columns["params"]),
         "starts": len(elements),
         "at_end": int(model.plant),
-        "kinds": _strings(variable.kind for variable in listed),
+        "kinds": _c_strings(variable.kind for variable in listed),
         # constants get the role of outputs, because neither can be set
-        "roles": _strings(variable.role.replace("c", "o") for variable in listed),
-        "values": "\n".join(f"    {_number(variable.start)}," for variable in listed),
+        "roles": _c_strings(variable.role.replace("c", "o") for variable in listed),
+        "values": "\n".join(f"    {_c_number(variable.start)}," for variable in listed),
         "filter": "\n".join(lines),
-        "period": first + code.columns["params"].index("period"),
-        **{name: rows[name] for name in ("in_from", "params_from", "out_to")},
+        "period": first_parameter + code.columns["params"].index("period"),
+        **{name: row_texts[name] for name in ("in_from", "params_from", "out_to")},
     }
-    texts = {f"fmi{version}.c": templates.filled(f"fmi{version}.c"), **model.texts}
-    header = templates.filled("fmu.h", token="", **values)
+    texts = {f"fmi{version}.c": templates.fill_template(f"fmi{version}.c"), **model.texts}
+    header = templates.fill_template("fmu.h", token="", **values)
     token = hashlib.sha256("".join([*texts.values(), header]).encode()).hexdigest()
-    texts["fmu.h"] = templates.filled("fmu.h", token=token, **values)
-    return {name: templates.with_public_prefix(text, model.about.name) for name, text in texts.items()}, token
+    texts["fmu.h"] = templates.fill_template("fmu.h", token=token, **values)
+    return {name: templates.with_public_prefix(text, model.info.name) for name, text in texts.items()}, token
 
 
-def _strings(letters: Iterable[str]) -> str:
+def _c_strings(letters: Iterable[str]) -> str:
     """Return a C string of letters, 100 on a line."""
     text = "".join(letters)
     return "\n".join(f'    "{text[k : k + 100]}"' for k in range(0, len(text), 100))
 
 
-def _number(value: float) -> str:
+def _c_number(value: float) -> str:
     return repr(value) if math.isfinite(value) else "INFINITY" if value > 0.0 else "-INFINITY"
 
 
-def description(model: Model, version: int, token: str, units: Sequence[str]) -> str:
-    """Return modelDescription.xml.
+def model_description(model: Model, version: int, token: str, c_files: Sequence[str]) -> str:
+    """Return the text of modelDescription.xml.
 
     Args:
         model: the model.
         version: version of FMI.
         token: instantiation token, which the binary compares with the token that a simulator passes.
-        units: names of the C files that are compiled.
+        c_files: names of the C files that are compiled.
     """
-    listed = variables(model)
-    found = {one.name: one for one in (variable.unit for variable in listed) if one is not None}
-    bases = {
-        name: "".join(f' {base}="{power}"' for base, power in one.exponents.items()) for name, one in found.items()
+    listed = list_variables(model)
+    units_by_name = {unit.name: unit for unit in (variable.unit for variable in listed) if unit is not None}
+    exponents = {
+        name: "".join(f' {base}="{power}"' for base, power in unit.exponents.items())
+        for name, unit in units_by_name.items()
     }
     outputs = [k for k, variable in enumerate(listed) if variable.role == "o"]
-    unknown = '    <Output valueReference="{}"/>', '    <InitialUnknown valueReference="{}"/>'
+    output_elements = '    <Output valueReference="{}"/>', '    <InitialUnknown valueReference="{}"/>'
     if version == 2:
         outputs = [k + 1 for k in outputs]
-        unknown = ('      <Unknown index="{}"/>',) * 2
-    made = {
+        output_elements = ('      <Unknown index="{}"/>',) * 2
+    values = {
         "title": quoteattr(model.title),
         "token": token,
         "about": quoteattr(f"{model.title}, one sample every {model.period:g} s"),
-        "identifier": model.about.stem,
-        "sources": "\n".join(f'      <File name="{name}"/>' for name in units),
-        "units": "\n".join(f'    <Unit name="{name}"><BaseUnit{text}/></Unit>' for name, text in bases.items()),
+        "identifier": model.info.stem,
+        "sources": "\n".join(f'      <File name="{name}"/>' for name in c_files),
+        "units": "\n".join(f'    <Unit name="{name}"><BaseUnit{text}/></Unit>' for name, text in exponents.items()),
         "stop": f"{model.t_end:g}",
         "step": repr(model.period),
-        "variables": "\n".join(_variable(variable, k, version) for k, variable in enumerate(listed)),
-        "outputs": "\n".join(unknown[0].format(k) for k in outputs),
-        "unknowns": "\n".join(unknown[1].format(k) for k in outputs),
+        "variables": "\n".join(_variable_element(variable, k, version) for k, variable in enumerate(listed)),
+        "outputs": "\n".join(output_elements[0].format(k) for k in outputs),
+        "unknowns": "\n".join(output_elements[1].format(k) for k in outputs),
     }
     if version == 3:
         time = f'    <Float64 name="time" valueReference="{len(listed)}" causality="independent" unit="s"/>'
-        made["variables"] += "\n" + time
-    return templates.filled(f"fmi{version}.xml", **made)
+        values["variables"] += "\n" + time
+    return templates.fill_template(f"fmi{version}.xml", **values)
 
 
-def _variable(variable: Variable, reference: int, version: int) -> str:
-    """Return the element of a variable."""
+def _variable_element(variable: Variable, reference: int, version: int) -> str:
+    """Return the XML element of a variable."""
     causality = {"i": "input", "o": "output", "c": "local"}.get(variable.role, "parameter")
     variability = {"f": "fixed", "t": "tunable", "c": "constant"}.get(variable.role)
     variability = variability or ("continuous" if variable.kind == "r" else "discrete")
-    named = f'name="{variable.name}" valueReference="{reference}" causality="{causality}" variability="{variability}"'
-    named += f" description={quoteattr(variable.about)}" if variable.about else ""
+    attributes = f'name="{variable.name}" valueReference="{reference}" causality="{causality}"'
+    attributes += f' variability="{variability}"'
+    attributes += f" description={quoteattr(variable.meaning)}" if variable.meaning else ""
     values = "" if variable.unit is None else f' unit="{variable.unit.name}"'
     if variable.role != "o":
         values += f' start="{variable.start!r}"' if variable.kind == "r" else f' start="{int(variable.start)}"'
     if version == 3:
-        return f"    <{TYPES[3][variable.kind]} {named}{values}/>"
-    return f"    <ScalarVariable {named}><{TYPES[2][variable.kind]}{values}/></ScalarVariable>"
+        return f"    <{TYPES[3][variable.kind]} {attributes}{values}/>"
+    return f"    <ScalarVariable {attributes}><{TYPES[2][variable.kind]}{values}/></ScalarVariable>"
 
 
 def binary_path(name: str, version: int) -> str:
@@ -226,7 +239,7 @@ def binary_path(name: str, version: int) -> str:
     return f"binaries/{folder}/{name}{suffix}"
 
 
-def write(file: Path, model: Model, version: int, *, binary: bool = True) -> None:
+def write_fmu(file: Path, model: Model, version: int, *, binary: bool = True) -> None:
     """Write an FMU.
 
     Args:
@@ -238,15 +251,16 @@ def write(file: Path, model: Model, version: int, *, binary: bool = True) -> Non
     Raises:
         ScenarioError: if there is no C compiler for the binary.
     """
-    (texts, token), name = sources(model, version), model.about.stem
-    units = [name for name in texts if name.endswith(".c")]
+    (texts, token), name = source_texts(model, version), model.info.stem
+    c_files = [name for name in texts if name.endswith(".c")]
     content: dict[str, str | bytes] = {f"sources/{file}": text for file, text in texts.items()}
-    content["modelDescription.xml"] = description(model, version, token, units)
+    content["modelDescription.xml"] = model_description(model, version, token, c_files)
     if version == 3:
-        listed = "\n".join(f'      <SourceFile name="{unit}"/>' for unit in units)
-        content["sources/buildDescription.xml"] = templates.filled("build.xml", identifier=name, sources=listed)
+        source_files = "\n".join(f'      <SourceFile name="{c_file}"/>' for c_file in c_files)
+        description = templates.fill_template("build.xml", identifier=name, sources=source_files)
+        content["sources/buildDescription.xml"] = description
     if binary:
-        content[binary_path(name, version)] = compiled(texts, units)
+        content[binary_path(name, version)] = compile_binary(texts, c_files)
     with zipfile.ZipFile(file, "w") as archive:
         for path, data in content.items():
             info = zipfile.ZipInfo(path, (1980, 1, 1, 0, 0, 0))  # fixed date: the same content gives the same file
@@ -254,12 +268,12 @@ def write(file: Path, model: Model, version: int, *, binary: bool = True) -> Non
             archive.writestr(info, data)
 
 
-def compiled(texts: dict[str, str], units: Sequence[str]) -> bytes:
+def compile_binary(texts: dict[str, str], c_files: Sequence[str]) -> bytes:
     """Return the shared library of these C files. Raises ScenarioError without a compiler, or if it fails."""
-    with tempfile.TemporaryDirectory(prefix="ptsmc-") as made:
+    with tempfile.TemporaryDirectory(prefix="ptsmc-") as build_folder:
         for name, text in texts.items():
-            (Path(made) / name).write_text(text, encoding="utf-8")
-        error = build("-fvisibility=hidden", *units, "-o", "binary", folder=Path(made))
+            (Path(build_folder) / name).write_text(text, encoding="utf-8")
+        error = compile_library("-fvisibility=hidden", *c_files, "-o", "binary", folder=Path(build_folder))
         if error:
             raise ScenarioError(f"the C code of the FMU does not compile: {error}")
-        return (Path(made) / "binary").read_bytes()
+        return (Path(build_folder) / "binary").read_bytes()

@@ -12,14 +12,14 @@ import numpy as np
 from ptsmc_jax import scenario as scenarios
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.numerics import draws
-from ptsmc_jax.onboard import fmu as units
+from ptsmc_jax.onboard import fmu as fmu_files
 from ptsmc_jax.onboard import templates, vectors
-from ptsmc_jax.onboard.board import Board, board
+from ptsmc_jax.onboard.board import Board, build_board
 from ptsmc_jax.onboard.generate import Code, generate
 from ptsmc_jax.onboard.plant import plant_board
 from ptsmc_jax.onboard.readme import readme
 from ptsmc_jax.onboard.sources import LAYOUT
-from ptsmc_jax.onboard.templates import About
+from ptsmc_jax.onboard.templates import ExportInfo
 from ptsmc_jax.onboard.translate import NoRuleError
 from ptsmc_jax.scenario import custom, parsing
 from ptsmc_jax.scenario.assembly import Study
@@ -35,13 +35,13 @@ class Controller:
         self.scenario = on_flight_clock(scenario)
         self.ready: Study = scenarios.study(self.scenario)
         self.reference_input = reference_input  # whether the reference is an input
-        self.board: Board = board(self.ready.parts, reference_input)
+        self.board: Board = build_board(self.ready.parts, reference_input)
         try:
             self.code: Code = generate(self.board)
         except NoRuleError as error:
             raise ScenarioError(str(error)) from None
         law, device = self.ready.parts.controller, self.ready.parts.actuators
-        self.about = About(
+        self.info = ExportInfo(
             name, source, checksum(self.scenario), type(law).__qualname__, self.board.parameters["filter"] is not None,
             self.board.model.largest_measurement,
             device.delay, float((law.t_f / self.last_time_to_go) ** 2),
@@ -84,22 +84,22 @@ def identifier(text: str) -> str:
     return plain if plain and not plain[0].isdigit() else f"c_{plain}".rstrip("_")
 
 
-def simulate(made: Controller, seed: int, trials: int) -> dict[int, vectors.Samples]:
+def simulate(controller: Controller, seed: int, trials: int) -> dict[int, vectors.Samples]:
     """Return simulated trials that can be used as test vectors, by number of the trial.
 
     Args:
-        made: the controller.
+        controller: the controller.
         seed: seed of the trials.
         trials: number of trials.
 
     Raises:
-        ScenarioError: if no trial is usable, see `vectors.usable`.
+        ScenarioError: if no trial is usable, see `vectors.is_usable`.
     """
-    dispersion = vectors.with_nominal_reference(made.ready.dispersion)
+    dispersion = vectors.with_nominal_reference(controller.ready.dispersion)
     numbers = np.arange(trials, dtype=np.uint32)
-    simulated = vectors.simulate_many(made.ready.parts, dispersion, jnp.uint32(seed), jnp.asarray(numbers))
-    each = {int(k): vectors.one(simulated, int(k)) for k in numbers}
-    usable = {k: samples for k, samples in each.items() if vectors.usable(samples)}
+    simulated = vectors.simulate_many(controller.ready.parts, dispersion, jnp.uint32(seed), jnp.asarray(numbers))
+    samples_by_trial = {int(k): vectors.single_trial(simulated, int(k)) for k in numbers}
+    usable = {k: samples for k, samples in samples_by_trial.items() if vectors.is_usable(samples)}
     if not usable:
         raise ScenarioError(
             f"none of the first {trials} trials is finite and away from the law's singularity, but the test vectors "
@@ -108,49 +108,53 @@ def simulate(made: Controller, seed: int, trials: int) -> dict[int, vectors.Samp
     return usable
 
 
-def table(made: Controller, simulated: dict[int, vectors.Samples]) -> tuple[list[str], list[list[Any]]]:
+def vector_table(
+    controller: Controller, samples_by_trial: dict[int, vectors.Samples]
+) -> tuple[list[str], list[list[Any]]]:
     """Return the header and the rows of vectors.csv."""
-    lists = made.code.columns
+    columns = controller.code.columns
     header = [
         "trial",
         "sample",
         "status",
-        *(f"{kind}.{name}" for kind in ("in", "out", "state") for name in lists[kind]),
+        *(f"{kind}.{name}" for kind in ("in", "out", "state") for name in columns[kind]),
     ]
     rows: list[list[Any]] = []
-    for k, samples in simulated.items():
-        given, out, state = vectors.rows(made.board, samples)
-        nothing = [0.0] * (given.shape[1] + out.shape[1])
-        rows.append([k, -1, 0, *nothing, *vectors.first_state(made.board, samples).tolist()])
-        together = np.column_stack([given, out, state]).tolist()
-        rows += [[k, n, int(cut), *row] for n, (cut, row) in enumerate(zip(samples.limited, together, strict=True))]
+    for k, samples in samples_by_trial.items():
+        inputs, outputs, state = vectors.rows(controller.board, samples)
+        zeros = [0.0] * (inputs.shape[1] + outputs.shape[1])
+        rows.append([k, -1, 0, *zeros, *vectors.first_state(controller.board, samples).tolist()])
+        sample_rows = np.column_stack([inputs, outputs, state]).tolist()
+        numbered = enumerate(zip(samples.limited, sample_rows, strict=True))
+        rows += [[k, n, int(limited), *row] for n, (limited, row) in numbered]
     return header, rows
 
 
-def controller_model(made: Controller) -> units.Model:
+def controller_model(controller: Controller) -> fmu_files.Model:
     """Return the controller as the model of an FMU."""
-    texts, stem = templates.texts(made.code, made.about), made.about.stem
-    filtered = [field for field in made.code.state if made.about.filtered and field.name in units.FILTER_STATE]
-    title, t_end = f"controller of {made.about.scenario}", float(made.ready.parts.t_end)
-    kept = {name: texts[name] for name in (f"{stem}.c", f"{stem}.h")}
-    return units.Model(made.code, made.about, title, kept, t_end, filtered)
+    code, info = controller.code, controller.info
+    texts = templates.controller_texts(code, info)
+    filter_state = [field for field in code.state if info.has_filter and field.name in fmu_files.FILTER_STATE]
+    title, t_end = f"controller of {info.scenario}", float(controller.ready.parts.t_end)
+    c_texts = {name: texts[name] for name in (f"{info.stem}.c", f"{info.stem}.h")}
+    return fmu_files.Model(code, info, title, c_texts, t_end, filter_state)
 
 
-def plant_model(made: Controller) -> units.Model:
+def plant_model(controller: Controller) -> fmu_files.Model:
     """Return the true plant of a controller's scenario as the model of an FMU.
 
     Raises:
         ScenarioError: if it cannot be written in C.
     """
-    ready, about = made.ready, made.about._replace(name=f"{made.about.name}_plant", filtered=False)
+    ready, info = controller.ready, controller.info._replace(name=f"{controller.info.name}_plant", has_filter=False)
     try:
-        code = generate(plant_board(ready.parts, ready.dispersion, made.board))
+        code = generate(plant_board(ready.parts, ready.dispersion, controller.board))
     except NoRuleError as error:
         raise ScenarioError(str(error)) from None
-    if code.fixed:
-        raise ScenarioError(f"the plant cannot be exported: {next(iter(code.fixed.values()))}")
-    title = f"plant of {about.scenario}"
-    return units.Model(code, about, title, templates.plant_texts(code, about), float(ready.parts.t_end), plant=True)
+    if code.underivable:
+        raise ScenarioError(f"the plant cannot be exported: {next(iter(code.underivable.values()))}")
+    title = f"plant of {info.scenario}"
+    return fmu_files.Model(code, info, title, templates.plant_texts(code, info), float(ready.parts.t_end), plant=True)
 
 
 class Fmus(NamedTuple):
@@ -161,31 +165,31 @@ class Fmus(NamedTuple):
     version: int | None = None  # version of FMI, 2 or 3; None: both
     binary: bool = True  # whether they contain a binary for this machine
 
-    def write(self, folder: Path, made: Controller) -> None:
+    def write(self, folder: Path, controller: Controller) -> None:
         """Write the FMUs of a controller and of its plant into a folder.
 
         Raises:
             ScenarioError: if the plant cannot be written in C, or there is no C compiler for a binary.
         """
-        for name, model_of in (("controller", controller_model), ("plant", plant_model)):
+        for name, build_model in (("controller", controller_model), ("plant", plant_model)):
             if getattr(self, name):
-                model = model_of(made)
+                model = build_model(controller)
                 for version in self.versions:
-                    units.write(folder / _file(name, version), model, version, binary=self.binary)
+                    fmu_files.write_fmu(folder / _fmu_file(name, version), model, version, binary=self.binary)
 
     @property
     def versions(self) -> tuple[int, ...]:
         """The versions of FMI to write."""
-        return units.VERSIONS if self.version is None else (self.version,)
+        return fmu_files.VERSIONS if self.version is None else (self.version,)
 
     @property
     def files(self) -> list[str]:
         """The names of the FMUs."""
         kinds = [name for name in ("controller", "plant") if getattr(self, name)]
-        return [_file(name, version) for name in kinds for version in self.versions]
+        return [_fmu_file(name, version) for name in kinds for version in self.versions]
 
 
-def _file(name: str, version: int) -> str:
+def _fmu_file(name: str, version: int) -> str:
     """Return the name of an FMU; name: controller or plant, version: of FMI."""
     return f"{name}_fmi{version}.fmu"
 
@@ -193,41 +197,43 @@ def _file(name: str, version: int) -> str:
 NO_FMUS = Fmus()
 
 
-def write(folder: Path, made: Controller, seed: int, trials: int, fmus: Fmus = NO_FMUS) -> None:
+def write(folder: Path, controller: Controller, seed: int, trials: int, fmus: Fmus = NO_FMUS) -> None:
     """Write all files into an existing folder.
 
     Args:
         folder: the folder.
-        made: the controller.
+        controller: the controller.
         seed: seed of the trials in the test vectors.
         trials: number of these trials.
         fmus: the FMUs to write.
     """
-    fmus.write(folder, made)
-    simulated, t_f = simulate(made, seed, trials), float(made.ready.parts.controller.t_f)
-    rounding = made.board.model.error_rounding
-    header, rows = table(made, simulated)
-    steepness = min(vectors.steepness(one, rounding, t_f, made.last_time_to_go) for one in simulated.values())
-    write_program(folder, made, steepness)
+    fmus.write(folder, controller)
+    samples_by_trial, t_f = simulate(controller, seed, trials), float(controller.ready.parts.controller.t_f)
+    rounding, last = controller.board.model.error_rounding, controller.last_time_to_go
+    header, rows = vector_table(controller, samples_by_trial)
+    growth = min(vectors.rounding_growth(samples, rounding, t_f, last) for samples in samples_by_trial.values())
+    write_program(folder, controller, growth)
     store.write_csv(folder / "vectors.csv", header, rows)
-    made_by = {"command": "export", "seed": seed, **custom.checksums(made.scenario)}
-    store.record(folder, parsing.dump(made.scenario), made_by)
+    origin = {"command": "export", "seed": seed, **custom.checksums(controller.scenario)}
+    store.write_run_files(folder, parsing.dump(controller.scenario), origin)
 
 
-def write_program(folder: Path, made: Controller, steepness: float = 0.0) -> None:
+def write_program(folder: Path, controller: Controller, rounding_growth: float = 0.0) -> None:
     """Write the files that do not need trials.
 
     Args:
         folder: the folder.
-        made: the controller.
-        steepness: lower limit of the steepness in check.c, see `About`.
+        controller: the controller.
+        rounding_growth: lower limit of the growth of rounding errors in check.c, see `ExportInfo`.
     """
-    code, about = made.code, made.about._replace(steepness=max(made.about.steepness, steepness))
-    texts = {**templates.texts(code, about), "README.md": readme(code, about)}
+    code, info = controller.code, controller.info
+    info = info._replace(rounding_growth=max(info.rounding_growth, rounding_growth))
+    texts = {**templates.controller_texts(code, info), "README.md": readme(code, info)}
     for name, text in texts.items():
-        store.write_text(folder / name, templates.with_public_prefix(text, about.name))
-    layout = {"name": about.name, "checksum": about.checksum, "period": made.period, "parts": made.board.parts}
-    layout["reference_input"] = made.reference_input
+        store.write_text(folder / name, templates.with_public_prefix(text, info.name))
+    parts = controller.board.part_descriptions
+    layout = {"name": info.name, "checksum": info.checksum, "period": controller.period, "parts": parts}
+    layout["reference_input"] = controller.reference_input
     layout["columns"] = code.columns
     store.write_json(folder / LAYOUT, layout)
 
@@ -261,16 +267,16 @@ def export(
         ValueError: if `trials`, `seed` or `fmi` is not a valid number.
     """
     path = Path(folder)
-    if fmi not in (None, *units.VERSIONS):
+    if fmi not in (None, *fmu_files.VERSIONS):
         raise ValueError(f"fmi is {fmi!r}, but must be 2, 3 or None for both")
     draws.check_whole_number("trials", trials, 1)
     draws.check_whole_number("seed", seed)
-    store.check(path, force)
-    known = what if isinstance(what, Scenario) else scenarios.read(what)
+    store.check_folder(path, force)
+    loaded = what if isinstance(what, Scenario) else scenarios.read(what)
     source = "a scenario" if isinstance(what, Scenario) else Path(what).name
     stem = identifier(name or ("flight" if isinstance(what, Scenario) else Path(what).stem))
-    made = Controller(known, stem, source, reference_input)
+    controller = Controller(loaded, stem, source, reference_input)
     fmus = Fmus(fmu, fmu_plant, fmi, binary)
-    with store.in_use(path, force=force):
-        store.write(path, lambda making: write(making, made, seed, trials, fmus))
+    with store.lock_folder(path, force=force):
+        store.write_folder(path, lambda making: write(making, controller, seed, trials, fmus))
     return path

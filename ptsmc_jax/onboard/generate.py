@@ -15,15 +15,16 @@ from ptsmc_jax.observers.base import Observer
 from ptsmc_jax.onboard import origins, parameters, printing
 from ptsmc_jax.onboard.board import SCALARS, Board, Stage
 from ptsmc_jax.onboard.expressions import Node, Pool, Title, kind_of
-from ptsmc_jax.onboard.fields import Field, struct
+from ptsmc_jax.onboard.fields import Field, struct_fields
 from ptsmc_jax.onboard.translate import Translator
 
 Struct = dict[str, list[Field]]  # the fields of each named tree
 POINTERS = {"p": "const ptsmc_params *p", "d": "const ptsmc_derived *d", "in": "const ptsmc_in *in",
             "before": "const ptsmc_state *before", "now": "ptsmc_state *now", "out": "ptsmc_out *out"}  # fmt: skip
-PASSED = {"d": "&state->derived", "before": "state", "now": "&now", "out": "&found"}  # arguments in ptsmc_step
-ARGUMENTS = {"t": "real t", "dt": "real dt", "regular": "int regular", "tracking": "int tracking"}
-COMMON = (object, Law, AccelerationLaw, Kinematics, AttitudeKinematics, Observer)  # docstrings that C comments omit
+CALL_ARGUMENTS = {"d": "&state->derived", "before": "state", "now": "&now", "out": "&found"}  # arguments in ptsmc_step
+SCALAR_PARAMETERS = {"t": "real t", "dt": "real dt", "regular": "int regular", "tracking": "int tracking"}
+# classes whose docstrings are omitted from the comments in C
+COMMON_BASES = (object, Law, AccelerationLaw, Kinematics, AttitudeKinematics, Observer)
 
 
 @dataclass
@@ -37,58 +38,60 @@ class Code:
     outputs: list[Field]
     functions: list[str] = field(default_factory=list)  # text of the functions
     calls: dict[str, str] = field(default_factory=dict)  # text of the function calls, by stage
-    about: dict[str, str] = field(default_factory=dict)  # description of each stage of a sample
+    stage_descriptions: dict[str, str] = field(default_factory=dict)  # description of each stage of a sample
     counts: Counter[str] = field(default_factory=Counter)  # largest number of operations of a step, by operation
-    open: bool = False  # whether a loop has an unknown number of passes; `counts` includes one pass of it
+    has_open_loop: bool = False  # whether a loop has an unknown number of passes; `counts` includes one pass of it
     derived: list[Field] = field(default_factory=list)  # numbers that C derives from parameters
-    basis: list[Field] = field(default_factory=list)  # parameters that determine the derived numbers
+    derivation_inputs: list[Field] = field(default_factory=list)  # parameters that determine the derived numbers
     derivation: str = ""  # text of the function that computes the derived numbers
-    follows: dict[str, list[str]] = field(default_factory=dict)  # parameters that each derived number depends on
-    fixed: dict[str, str] = field(default_factory=dict)  # reason why C cannot derive a parameter, by name
-    deriving: dict[str, int] = field(default_factory=dict)  # number of operations of the derivation
+    sources_of: dict[str, list[str]] = field(default_factory=dict)  # parameters that each derived number depends on
+    underivable: dict[str, str] = field(default_factory=dict)  # reason why C cannot derive a parameter, by name
+    derivation_counts: dict[str, int] = field(default_factory=dict)  # number of operations of the derivation
     variables: int = 0  # largest number of variables in a function
 
     @property
     def columns(self) -> dict[str, list[str]]:
-        """The names of the elements, by struct, see the function `columns`."""
-        params = [element for made in self.parameters for element in made.elements()]
-        return {**columns(self.inputs, self.state, self.outputs), "params": params}
+        """The names of the elements, by struct, see the function `struct_columns`."""
+        parameters = [element for member in self.parameters for element in member.elements()]
+        return {**struct_columns(self.inputs, self.state, self.outputs), "params": parameters}
 
 
 def generate(board: Board) -> Code:
     """Return the C of a flight computer. Raises NoRuleError if an operation has no counterpart in C."""
-    known, structs = parameters.parameters(board), _structs(board)
-    known.used.update(board.always)
-    inputs, state, outputs = map(_listed, structs.values())
+    params, structs = parameters.collect_parameters(board), _fields_by_struct(board)
+    params.used.update(board.always_exported)
+    inputs, state, outputs = map(_declared_fields, structs.values())
     code = Code([], {}, inputs, state, outputs)
     for stage in board.stages:
-        _function(code, board, stage, structs, known)
-    _derivation(code, known)
-    code.parameters = known.listed("p")
-    code.values = {made.name: known.values[made.name] for made in code.parameters}
+        _add_stage_function(code, board, stage, structs, params)
+    _add_derivation(code, params)
+    code.parameters = params.used_fields("p")
+    code.values = {member.name: params.values[member.name] for member in code.parameters}
     return code
 
 
-def _derivation(code: Code, known: parameters.Parameters) -> None:
+def _add_derivation(code: Code, params: parameters.Parameters) -> None:
     """Add the function that derives numbers from parameters."""
-    code.derived = known.listed("d")
-    follows = {made.name: known.origins[made.name] for made in code.derived}
-    code.fixed = {name: why for name, why in known.fixed.items() if name in known.used}
-    code.follows = follows | {name: known.origins[name] for name in code.fixed}
+    code.derived = params.used_fields("d")
+    sources_of = {member.name: params.sources_of[member.name] for member in code.derived}
+    code.underivable = {name: reason for name, reason in params.underivable.items() if name in params.used}
+    code.sources_of = sources_of | {name: params.sources_of[name] for name in code.underivable}
     if not code.derived:
         return
     printer = printing.Printer()
-    block, results = known.derivation()
-    ends = [(f"d->{element}", node) for made in code.derived
-            for element, node in zip(made.elements(), results[made.name].flat, strict=True)]  # fmt: skip
-    body = printer.body(block, ends)
-    known.use(printer)
-    code.basis = [made for made in known.listed("p") if any(made.name in names for names in follows.values())]
-    copies = [f"    d->of_{element} = p->{element};" for made in code.basis for element in made.elements()]
-    about = printing.comment("Compute the derived numbers from the parameters, and copy these parameters.")
-    head = [*about, "static void derive(const ptsmc_params *p, ptsmc_derived *d)", "{"]
-    code.derivation = "\n".join([*head, *body, "", *copies, "}"])
-    code.deriving = dict(printer.counts)
+    block, results = params.translate_rules()
+    outputs = [(f"d->{element}", node) for member in code.derived
+            for element, node in zip(member.elements(), results[member.name].flat, strict=True)]  # fmt: skip
+    body = printer.body(block, outputs)
+    params.mark_used(printer)
+    inputs = {name for names in sources_of.values() for name in names}
+    code.derivation_inputs = [member for member in params.used_fields("p") if member.name in inputs]
+    elements = [element for member in code.derivation_inputs for element in member.elements()]
+    copy_lines = [f"    d->of_{element} = p->{element};" for element in elements]
+    comment = printing.format_comment("Compute the derived numbers from the parameters, and copy these parameters.")
+    head = [*comment, "static void derive(const ptsmc_params *p, ptsmc_derived *d)", "{"]
+    code.derivation = "\n".join([*head, *body, "", *copy_lines, "}"])
+    code.derivation_counts = dict(printer.counts)
     code.variables = max(code.variables, printer.variables)
 
 
@@ -96,16 +99,16 @@ def _shapes(board: Board) -> dict[str, dict[str, Any]]:
     return {"in": board.inputs, "before": board.state, "out": board.outputs}
 
 
-def _structs(board: Board) -> dict[str, Struct]:
-    return {name: struct(trees, board.about) for name, trees in _shapes(board).items()}
+def _fields_by_struct(board: Board) -> dict[str, Struct]:
+    return {name: struct_fields(trees, board.meanings) for name, trees in _shapes(board).items()}
 
 
-def _listed(made: Struct) -> list[Field]:
+def _declared_fields(struct: Struct) -> list[Field]:
     """Return the fields that C declares. Arrays without elements are left out, because C has none."""
-    return [one for group in made.values() for one in group if one.size]
+    return [member for members in struct.values() for member in members if member.size]
 
 
-def columns(inputs: Sequence[Field], state: Sequence[Field], outputs: Sequence[Field]) -> dict[str, list[str]]:
+def struct_columns(inputs: Sequence[Field], state: Sequence[Field], outputs: Sequence[Field]) -> dict[str, list[str]]:
     """Return the columns of inputs, outputs and state in vectors.csv, named as in C.
 
     Args:
@@ -117,19 +120,19 @@ def columns(inputs: Sequence[Field], state: Sequence[Field], outputs: Sequence[F
         The columns by struct: "in", "out" and "state".
     """
 
-    def all_of(members: Sequence[Field], owner: str = "") -> list[str]:
-        return [owner + element for made in members for element in made.elements()]
+    def element_names(members: Sequence[Field], prefix: str = "") -> list[str]:
+        return [prefix + element for member in members for element in member.elements()]
 
     return {
-        "in": ["t", *all_of(inputs)],
-        "out": all_of(outputs),
-        "state": ["t", "started", "tracking", *all_of(state), *all_of(outputs, "last.")],
+        "in": ["t", *element_names(inputs)],
+        "out": element_names(outputs),
+        "state": ["t", "started", "tracking", *element_names(state), *element_names(outputs, "last.")],
     }
 
 
-def names_of(board: Board) -> dict[str, list[str]]:
+def column_names(board: Board) -> dict[str, list[str]]:
     """Return the columns of vectors.csv for a flight computer, without generating its C."""
-    return columns(*map(_listed, _structs(board).values()))
+    return struct_columns(*map(_declared_fields, _fields_by_struct(board).values()))
 
 
 # struct, and text before the field in C, by the prefix of a name that a stage reads or writes
@@ -137,50 +140,52 @@ STRUCT_OF_PREFIX = {"in": "in", "before": "before", "now": "before", "last": "ou
 C_PREFIX = {"in": "in->", "before": "before->", "now": "now->", "last": "before->last.", "out": "out->"}
 
 
-def _function(code: Code, board: Board, stage: Stage, structs: dict[str, Struct], known: parameters.Parameters) -> None:
+def _add_stage_function(
+    code: Code, board: Board, stage: Stage, structs: dict[str, Struct], params: parameters.Parameters
+) -> None:
     """Add the function of a stage to the code."""
 
     def fields_of(name: str) -> list[Field]:
         prefix, _, key = name.partition(".")
         return structs[STRUCT_OF_PREFIX[prefix]][key]
 
-    def run(leaves: list[Any], read: list[Any]) -> dict[str, Any]:
-        return stage.run(known.tree(leaves), dict(zip(stage.reads, read, strict=True)))
+    def run_stage(leaves: list[Any], read_values: list[Any]) -> dict[str, Any]:
+        return stage.run(params.unflatten(leaves), dict(zip(stage.reads, read_values, strict=True)))
 
     pool, args = Pool(), list[np.ndarray]()
     shapes = [_shape_of(board, name) for name in stage.reads]
-    closed, written = jax.make_jaxpr(run, return_shape=True)(known.leaves, shapes)
+    jaxpr, written = jax.make_jaxpr(run_stage, return_shape=True)(params.leaves, shapes)
     for name, shape in zip(stage.reads, shapes, strict=True):
         if name in SCALARS:
             args.append(object_array((), [pool.place(name, kind_of(shape.dtype))]))
         else:
-            args += [made.nodes(pool, C_PREFIX[name.partition(".")[0]]) for made in fields_of(name)]
-    results = iter(Translator(pool).evaluate(closed, [*known.nodes(pool), *args]))
-    ends, returned, needed = list[tuple[str, Node]](), None, set[str]()
+            args += [member.nodes(pool, C_PREFIX[name.partition(".")[0]]) for member in fields_of(name)]
+    results = iter(Translator(pool).evaluate(jaxpr, [*params.nodes(pool), *args]))
+    assignments, return_value, needed_arguments = list[tuple[str, Node]](), None, set[str]()
     for name in sorted(written):  # JAX flattens a dict in this order
         if name == "limited":
-            returned = next(results).item()
+            return_value = next(results).item()
             continue
         prefix = name.partition(".")[0]
-        needed.add(prefix)
-        for made in fields_of(name):
+        needed_arguments.add(prefix)
+        for member in fields_of(name):
             result = next(results)
-            _titled(result, made.name)
-            places = (C_PREFIX[prefix] + element for element in made.elements())
-            ends += zip(places, result.flat, strict=True)
-    printer = printing.Printer(ARGUMENTS)
-    body = printer.body(pool.block, ends, returned=returned)
-    needed |= {node.value.partition("->")[0] for node in printer.nodes.values() if node.op == "place"}
-    known.use(printer)
-    arguments = {name: text for name, text in (POINTERS | ARGUMENTS).items() if name in needed}
-    kind = "void" if returned is None else "int"
-    head = printing.wrapped(f"static {kind} {stage.name}({', '.join(arguments.values())})", "")
-    code.functions.append("\n".join([*_documents(stage), *head, "{", *body, "}"]))
+            _name_variables(result, member.name)
+            locations = (C_PREFIX[prefix] + element for element in member.elements())
+            assignments += zip(locations, result.flat, strict=True)
+    printer = printing.Printer(SCALAR_PARAMETERS)
+    body = printer.body(pool.block, assignments, returned=return_value)
+    needed_arguments |= {node.value.partition("->")[0] for node in printer.nodes.values() if node.op == "place"}
+    params.mark_used(printer)
+    arguments = {name: text for name, text in (POINTERS | SCALAR_PARAMETERS).items() if name in needed_arguments}
+    kind = "void" if return_value is None else "int"
+    head = printing.wrap_statement(f"static {kind} {stage.name}({', '.join(arguments.values())})", "")
+    code.functions.append("\n".join([*_stage_comment(stage), *head, "{", *body, "}"]))
     if stage.name != "begin":
-        code.about[stage.name] = stage.about
-    code.calls[stage.name] = f"{stage.name}({', '.join(PASSED.get(name, name) for name in arguments)})"
+        code.stage_descriptions[stage.name] = stage.description
+    code.calls[stage.name] = f"{stage.name}({', '.join(CALL_ARGUMENTS.get(name, name) for name in arguments)})"
     code.counts.update(printer.counts)
-    code.open |= printer.open
+    code.has_open_loop |= printer.has_open_loop
     code.variables = max(code.variables, printer.variables)
 
 
@@ -189,17 +194,17 @@ def _shape_of(board: Board, name: str) -> Any:
     return SCALARS[name]() if name in SCALARS else _shapes(board)[STRUCT_OF_PREFIX[prefix]][key]
 
 
-def _titled(result: np.ndarray, name: str) -> None:
+def _name_variables(result: np.ndarray, name: str) -> None:
     """Name variables of branches and loops after the field that they are written to, if they have no name."""
     title = Title(name)
     for index, node in np.ndenumerate(result):
         if node.op == "variable" and node.title is None:
-            node.title, node.part = title, "".join(str(i + 1) for i in index)
+            node.title, node.indices = title, "".join(str(i + 1) for i in index)
 
 
-def _documents(stage: Stage) -> list[str]:
-    paragraphs = [stage.about]
+def _stage_comment(stage: Stage) -> list[str]:
+    paragraphs = [stage.description]
     for part in stage.parts:
-        for name, text in origins.documents(part, COMMON):
-            paragraphs += [" ".join(one.split()) for one in f"{name}: {text}".split("\n\n")]
-    return printing.comment("\n".join(paragraphs))
+        for name, text in origins.class_docstrings(part, COMMON_BASES):
+            paragraphs += [" ".join(paragraph.split()) for paragraph in f"{name}: {text}".split("\n\n")]
+    return printing.format_comment("\n".join(paragraphs))

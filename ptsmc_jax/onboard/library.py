@@ -22,15 +22,15 @@ import numpy as np
 from ptsmc_jax.devices.actuators import ActuatorState
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.onboard import sources
-from ptsmc_jax.onboard.board import board, known
-from ptsmc_jax.onboard.generate import names_of
-from ptsmc_jax.onboard.parameters import COMPUTED, named, parameters
-from ptsmc_jax.onboard.templates import filled, with_public_prefix
+from ptsmc_jax.onboard.board import board_parameters, build_board
+from ptsmc_jax.onboard.generate import column_names
+from ptsmc_jax.onboard.parameters import COMPUTED, collect_parameters, name_parameters
+from ptsmc_jax.onboard.templates import fill_template, with_public_prefix
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation.assembly import Parts
-from ptsmc_jax.simulation.computer import OURS, SAMPLES, Computer, Decision, Period, Software
+from ptsmc_jax.simulation.computer import PYTHON_SOFTWARE, SAMPLE_STATUSES, Computer, Decision, Period, Software
 
-EQUAL = 1e-6  # smaller differences, relative to the largest element, may be rounding to 32 bits
+PARAMETER_TOLERANCE = 1e-6  # smaller differences, relative to the largest element, may be rounding to 32 bits
 MOST_LISTED = 4  # largest number of parameters that a message lists
 _loaded = itertools.count()
 
@@ -39,28 +39,28 @@ def compiler() -> list[str]:
     """Return the command of the C compiler. Raises ScenarioError if there is none."""
     command = os.environ.get("CC", "")
     try:
-        named = shlex.split(command)
+        configured = shlex.split(command)
     except ValueError as error:
         raise ScenarioError(f"CC is {command}, but must be a command: {error}") from None
-    found = named or [name for name in ("cc", "gcc", "clang") if shutil.which(name)][:1]
-    if not found or shutil.which(found[0]) is None:
+    chosen = configured or [name for name in ("cc", "gcc", "clang") if shutil.which(name)][:1]
+    if not chosen or shutil.which(chosen[0]) is None:
         raise ScenarioError(
             f"there is no C compiler{f' {command}' if command else ''}; install cc, gcc or clang, or set CC to one"
         )
-    return found
+    return chosen
 
 
-def build(*arguments: str, folder: Path | None = None) -> str:
+def compile_library(*arguments: str, folder: Path | None = None) -> str:
     """Compile a shared library in a folder; return the first error of the compiler, empty if there is none.
 
     Raises:
         ScenarioError: if there is no C compiler.
     """
     command = [*compiler(), "-std=c99", "-O2", "-shared", "-fPIC", *arguments, "-lm"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-    if done.returncode == 0:
+    process = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    if process.returncode == 0:
         return ""
-    lines = done.stderr.strip().splitlines() or ["without a message"]
+    lines = process.stderr.strip().splitlines() or ["without a message"]
     errors = [line for line in lines if "error: " in line and not line.startswith("collect2: ")]
     return (errors or lines)[0]
 
@@ -71,105 +71,108 @@ class Library:
     def __init__(self, folder: str | Path, real: str = "double", options: tuple[str, ...] = ()):
         """Compile a folder. Raises ScenarioError if it is not a controller or does not compile."""
         self.folder = Path(folder)
-        none = ScenarioError(f"the controller is {self.folder}, but must be a folder that ptsmc export has written")
+        invalid = ScenarioError(f"the controller is {self.folder}, but must be a folder that ptsmc export has written")
         try:
             layout = json.loads((self.folder / sources.LAYOUT).read_text(encoding="utf-8"))
             self.name, self.checksum, self.columns = layout["name"], layout["checksum"], layout["columns"]
             self.period = float(layout["period"])  # control period [s]
             self.reference_input = bool(layout.get("reference_input", False))
-            self.parts = dict(layout.get("parts", {}))  # see `Board.parts`; files of earlier versions have none
+            # see `Board.part_descriptions`; files of earlier versions have none
+            self.part_descriptions = dict(layout.get("parts", {}))
             sizes = [len(self.columns[kind]) for kind in ("in", "out", "state", "params")]
             if not re.fullmatch(r"\w+", self.name, re.ASCII):
-                raise none
+                raise invalid
         except (OSError, ValueError, RecursionError, OverflowError, KeyError, TypeError):
-            raise none from None
-        with tempfile.TemporaryDirectory(prefix="ptsmc-") as place:  # a loaded library remains without its file
-            made = self._compiled(Path(place), real, options)
+            raise invalid from None
+        # the library stays loaded after its file has been deleted
+        with tempfile.TemporaryDirectory(prefix="ptsmc-") as build_folder:
+            library = self._compile(Path(build_folder), real, options)
             try:
-                self._made = ctypes.CDLL(str(made))
-                self._made.ptsmc_set()
+                self._binary = ctypes.CDLL(str(library))
+                self._binary.ptsmc_set()
             except (OSError, AttributeError) as error:  # built for another processor or language, or without a function
-                reason = str(error).removeprefix(f"{made}: ")
+                reason = str(error).removeprefix(f"{library}: ")
                 raise ScenarioError(
                     f"the controller in {self.folder} does not load after {shlex.join(compiler())} has compiled it: "
                     f"{reason}; use a C compiler for this machine, and put or #include all code in "
                     f"ptsmc_{self.name}.c and ptsmc_{self.name}_parameters.c"
                 ) from None
         # other sizes: the C belongs to another controller.json
-        if sizes != list((ctypes.c_long * 4).in_dll(self._made, "ptsmc_sizes")):
-            raise none
+        if sizes != list((ctypes.c_long * 4).in_dll(self._binary, "ptsmc_sizes")):
+            raise invalid
         # parameters (columns,) in the order of columns["params"]; the array shares its memory with the C
-        self.parameters = np.ctypeslib.as_array((ctypes.c_double * sizes[-1]).in_dll(self._made, "ptsmc_given"))
+        self.parameters = np.ctypeslib.as_array((ctypes.c_double * sizes[-1]).in_dll(self._binary, "ptsmc_given"))
         self.target = f"ptsmc_{self.name}_{self.checksum}_{real}_{next(_loaded)}"  # name of the C function in XLA
-        jax.ffi.register_ffi_target(self.target, jax.ffi.pycapsule(self._made.ptsmc_called), platform="cpu")
+        jax.ffi.register_ffi_target(self.target, jax.ffi.pycapsule(self._binary.ptsmc_called), platform="cpu")
 
-    def _compiled(self, place: Path, real: str, options: tuple[str, ...]) -> Path:
-        glue, library = place / "glue.c", place / "controller.so"
-        glue.write_text(with_public_prefix(filled("in_the_loop.c", name=self.name), self.name), encoding="utf-8")
-        alone = place / "controller"  # a copy of only those files that campaigns store and check
-        sources.copy(self.folder, alone)
-        files = [str(alone / f"ptsmc_{self.name}{end}.c") for end in ("", "_parameters")]
+    def _compile(self, folder: Path, real: str, options: tuple[str, ...]) -> Path:
+        glue, library = folder / "glue.c", folder / "controller.so"
+        glue.write_text(with_public_prefix(fill_template("in_the_loop.c", name=self.name), self.name), encoding="utf-8")
+        copied = folder / "controller"  # a copy of only those files that campaigns store and check
+        sources.copy(self.folder, copied)
+        files = [str(copied / f"ptsmc_{self.name}{end}.c") for end in ("", "_parameters")]
         # XLA's headers are system headers, so that compilers warn of our code only
-        flags = "-isystem", jax.ffi.include_dir(), *options, f"-DPTSMC_REAL={real}", f"-I{alone}"
-        error = build(*flags, *files, str(glue), "-o", str(library)).replace(str(alone), str(self.folder))
+        flags = "-isystem", jax.ffi.include_dir(), *options, f"-DPTSMC_REAL={real}", f"-I{copied}"
+        error = compile_library(*flags, *files, str(glue), "-o", str(library)).replace(str(copied), str(self.folder))
         if error:
             raise ScenarioError(f"the *.c and *.h files of the controller in {self.folder} do not compile: {error}")
         return library
 
-    def first(self) -> np.ndarray:
+    def initial_state(self) -> np.ndarray:
         """Return the state after `ptsmc_init`."""
         state = np.zeros(len(self.columns["state"]))
-        self._made.ptsmc_first(_at(state))
+        self._binary.ptsmc_first(_address(state))
         return state
 
-    def many(self, state: Any, given: Any, parameters: Any = np.nan) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def step_many(self, state: Any, inputs: Any, parameters: Any = np.nan) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Call `ptsmc_step` for each row.
 
         Args:
             state: states (.., columns).
-            given: inputs (.., columns).
+            inputs: inputs (.., columns).
             parameters: parameters (.., columns) of the rows; NaN selects the value of `self.parameters`.
 
         Returns:
             New states (.., columns), outputs (.., columns) and statuses (..).
         """
         shape = np.shape(state)[:-1]
-        state, given = (
+        state, inputs = (
             np.ascontiguousarray(v, dtype=float).reshape(*shape, len(self.columns[kind]))  # C reads doubles
-            for v, kind in ((state, "state"), (given, "in"))
+            for v, kind in ((state, "state"), (inputs, "in"))
         )
-        each = np.ascontiguousarray(np.broadcast_to(np.asarray(parameters, float), (*shape, self.parameters.size)))
+        parameter_shape = (*shape, self.parameters.size)
+        parameter_rows = np.ascontiguousarray(np.broadcast_to(np.asarray(parameters, float), parameter_shape))
         after, out = np.empty_like(state), np.empty((*shape, len(self.columns["out"])))
         status = np.empty(shape, dtype=np.int32)
         count = ctypes.c_long(int(np.prod(shape, dtype=int)))
-        self._made.ptsmc_many(count, *map(_at, (each, state, given, after, out, status)))
+        self._binary.ptsmc_many(count, *map(_address, (parameter_rows, state, inputs, after, out, status)))
         return after, out, status
 
-    def called(self, state: jax.Array, given: jax.Array, parameters: jax.Array) -> tuple[jax.Array, ...]:
+    def step_in_jax(self, state: jax.Array, inputs: jax.Array, parameters: jax.Array) -> tuple[jax.Array, ...]:
         """Call `ptsmc_step` for one row in a JAX program, or for many rows under vmap.
 
         Args:
             state: state (columns,), whose precision, 32 or 64 bits, is that of the results.
-            given: inputs (columns,).
+            inputs: inputs (columns,).
             parameters: parameters (columns,); NaN selects the value of `self.parameters`.
 
         Returns:
             The new state (columns,), the outputs (columns,) and the status.
         """
         real = jnp.promote_types(jnp.result_type(state, float), jnp.float32)
-        state, given, parameters = (
+        state, inputs, parameters = (
             jnp.asarray(v, real).reshape(len(self.columns[kind]))
-            for v, kind in ((state, "state"), (given, "in"), (parameters, "params"))
+            for v, kind in ((state, "state"), (inputs, "in"), (parameters, "params"))
         )
         out = jax.ShapeDtypeStruct((len(self.columns["out"]),), real)
         results = jax.ShapeDtypeStruct(state.shape, real), out, jax.ShapeDtypeStruct((), jnp.int32)
 
         # a callback would deadlock: it waits for a thread that copies arrays, and each device may block one
-        how: Any = jax.ffi.ffi_call(self.target, results, vmap_method="broadcast_all")
-        return tuple(how(state, given, parameters))
+        call: Any = jax.ffi.ffi_call(self.target, results, vmap_method="broadcast_all")
+        return tuple(call(state, inputs, parameters))
 
 
-def _at(array: np.ndarray) -> ctypes.c_void_p:
+def _address(array: np.ndarray) -> ctypes.c_void_p:
     return ctypes.c_void_p(array.ctypes.data)
 
 
@@ -182,50 +185,53 @@ class InTheLoop:
 
     def __init__(self, library: Library, parts: Parts, dispersion: Dispersion | None = None):
         """Check the controller. Raises ScenarioError if it has other parts, or cannot have the dispersions."""
-        self.library, self.board, self.nominal = library, board(parts, library.reference_input), parts
-        mine = names_of(self.board)
-        for kind, said in (("in", "inputs"), ("out", "outputs"), ("state", "state")):
-            if library.columns[kind] != mine[kind]:
+        self.library, self.board, self.nominal = library, build_board(parts, library.reference_input), parts
+        board_columns = column_names(self.board)
+        for kind, noun in (("in", "inputs"), ("out", "outputs"), ("state", "state")):
+            if library.columns[kind] != board_columns[kind]:
                 raise ScenarioError(
-                    f"the controller in {library.folder} has other {said} than the scenario, but must be an export of "
+                    f"the controller in {library.folder} has other {noun} than the scenario, but must be an export of "
                     "one with the same plant, law, observer, filter and actuators"
                 )
-        ours, theirs = self.board.parts, library.parts
-        other = next((name for name in {**ours, **theirs} if theirs and theirs.get(name) != ours.get(name)), None)
-        if other is not None:
+        scenario_parts, controller_parts = self.board.part_descriptions, library.part_descriptions
+        names = {**scenario_parts, **controller_parts} if controller_parts else {}
+        different = next((name for name in names if controller_parts.get(name) != scenario_parts.get(name)), None)
+        if different is not None:
             raise ScenarioError(
-                f"the controller in {library.folder} has the {other} {theirs.get(other, 'none')}, "
-                f"but must have the {other} of the scenario, {ours.get(other, 'none')}"
+                f"the controller in {library.folder} has the {different} {controller_parts.get(different, 'none')}, "
+                f"but must have the {different} of the scenario, {scenario_parts.get(different, 'none')}"
             )
         # either number may have been rounded to 32 bits
-        period, wanted = np.float32(parts.period), np.float32(library.period)
-        if period != wanted:
+        period, c_period = np.float32(parts.period), np.float32(library.period)
+        if period != c_period:
             raise ScenarioError(
-                f"loop.period is {period!s} s, but must be {wanted!s} s as in the controller in {library.folder}"
+                f"loop.period is {period!s} s, but must be {c_period!s} s as in the controller in {library.folder}"
             )
         columns, paths = library.columns["params"], jax.tree_util.tree_leaves_with_path(self.board.parameters)
-        firsts = zip(paths, (made.elements()[:1] for made in named(self.board).fields), strict=True)
+        first_elements = [member.elements()[:1] for member in name_parameters(self.board).fields]
         # the first column of each parameter in C, by its path
-        self._columns = {path: columns.index(*first) for (path, _), first in firsts if first and first[0] in columns}
+        pairs = zip(paths, first_elements, strict=True)
+        self._columns = {path: columns.index(*first) for (path, _), first in pairs if first and first[0] in columns}
         if dispersion is not None and dispersion.custom is not None:
-            self._check_draw(Dispersion(custom=dispersion.custom))
+            self._check_custom_dispersion(Dispersion(custom=dispersion.custom))
 
-    def _check_draw(self, dispersion: Dispersion) -> None:
+    def _check_custom_dispersion(self, dispersion: Dispersion) -> None:
         """Raise ScenarioError if a custom dispersion changes only one of several values that share a parameter in C."""
-        made, numbers = parameters(self.board), (jnp.uint32(0), jnp.uint32(0))
-        drawn = had = known(dispersion.apply(self.nominal, *numbers))
-        for rule in made.rules:
-            had = rule(had)
-        wanted, derived = (dict(jax.tree_util.tree_leaves_with_path(tree)) for tree in (drawn, had))
-        firsts = dict[str, Any]()
-        listed = zip(jax.tree_util.tree_leaves_with_path(self.board.parameters), made.fields, strict=True)
-        for (path, _), field in sorted(listed, key=lambda one: one[0][0][0].key in COMPUTED):
-            value = wanted.get(path)
-            stands = derived.get(path) if field.name in made.derived else firsts.setdefault(field.name, value)
-            if value is None or stands is None:
+        params, numbers = collect_parameters(self.board), (jnp.uint32(0), jnp.uint32(0))
+        drawn = updated = board_parameters(dispersion.apply(self.nominal, *numbers))
+        for rule in params.rules:
+            updated = rule(updated)
+        drawn_leaves, updated_leaves = (dict(jax.tree_util.tree_leaves_with_path(tree)) for tree in (drawn, updated))
+        first_values = dict[str, Any]()
+        pairs = zip(jax.tree_util.tree_leaves_with_path(self.board.parameters), params.fields, strict=True)
+        for (path, _), field in sorted(pairs, key=lambda item: item[0][0][0].key in COMPUTED):
+            value = drawn_leaves.get(path)
+            is_derived = field.name in params.derived
+            reference = updated_leaves.get(path) if is_derived else first_values.setdefault(field.name, value)
+            if value is None or reference is None:
                 continue
-            off = EQUAL * float(jnp.max(jnp.abs(value), initial=0.0))
-            if not np.allclose(stands, value, rtol=0.0, atol=off, equal_nan=True):
+            tolerance = PARAMETER_TOLERANCE * float(jnp.max(jnp.abs(value), initial=0.0))
+            if not np.allclose(reference, value, rtol=0.0, atol=tolerance, equal_nan=True):
                 raise ScenarioError(
                     f"dispersion.custom changes {jax.tree_util.keystr(path, simple=True, separator='.')} alone, but "
                     f"the controller in {self.library.folder} has the single parameter {field.name} for it and other "
@@ -235,20 +241,20 @@ class InTheLoop:
     @property
     def parameter_differences(self) -> str:
         """A sentence that lists the parameters of C that differ from the scenario; empty if there are none."""
-        simulated, made = (
+        compiled, params = (
             dict(zip(self.library.columns["params"], self.library.parameters, strict=True)),
-            named(self.board),
+            name_parameters(self.board),
         )
-        fields, differing = {field.name: field.elements() for field in made.fields}, list[str]()
-        for name, values in made.values.items():
-            off = EQUAL * np.max(np.abs(values), initial=0.0, where=np.isfinite(values))
-            for element, value in zip(fields[name], np.ravel(values), strict=True):
-                if element in simulated and not np.isclose(simulated[element], value, rtol=0.0, atol=off):
-                    differing.append(f"{element} = {simulated[element]:.6g} instead of {value:.6g}")
+        elements_of, differing = {field.name: field.elements() for field in params.fields}, list[str]()
+        for name, values in params.values.items():
+            tolerance = PARAMETER_TOLERANCE * np.max(np.abs(values), initial=0.0, where=np.isfinite(values))
+            for element, value in zip(elements_of[name], np.ravel(values), strict=True):
+                if element in compiled and not np.isclose(compiled[element], value, rtol=0.0, atol=tolerance):
+                    differing.append(f"{element} = {compiled[element]:.6g} instead of {value:.6g}")
         if not differing:
             return ""
-        more = f" and {len(differing) - MOST_LISTED} more" if len(differing) > MOST_LISTED else ""
-        return f"the controller has other parameters than the scenario: {', '.join(differing[:MOST_LISTED])}{more}"
+        rest = f" and {len(differing) - MOST_LISTED} more" if len(differing) > MOST_LISTED else ""
+        return f"the controller has other parameters than the scenario: {', '.join(differing[:MOST_LISTED])}{rest}"
 
     @property
     def software(self) -> Software:
@@ -267,11 +273,11 @@ class InTheLoop:
             x0: true state at the first sample.
             first: the first control period.
         """
-        computer = OURS.boot(parts, seed, trial, x0, first)
-        state = jnp.asarray(self.library.first())
-        for name, value in parts.sensors.remembered(computer.sensors).items():
-            state = self._with(state, name, value)
-        return computer._replace(sensors=(computer.sensors, state, jnp.zeros(len(SAMPLES), jnp.int32)))
+        computer = PYTHON_SOFTWARE.boot(parts, seed, trial, x0, first)
+        state = jnp.asarray(self.library.initial_state())
+        for name, value in parts.sensors.filter_state(computer.sensors).items():
+            state = self._set_columns(state, name, value)
+        return computer._replace(sensors=(computer.sensors, state, jnp.zeros(len(SAMPLE_STATUSES), jnp.int32)))
 
     def decide(
         self, parts: Parts, k2: Any, period: Period, computer: Computer, x: Any, star_x: Any, acting: ActuatorState
@@ -284,7 +290,7 @@ class InTheLoop:
             period: the control period.
             computer: the flight computer before the sample.
             x: true state at the sample.
-            star_x: true state at the times of `Sensor.taken_ago`.
+            star_x: true state at the times of `Sensor.newest_reading_age`.
             acting: true state of the actuators, for telemetry.
         """
         (now, dt_before, *_), (sensing, state, counts) = period, computer.sensors
@@ -294,46 +300,47 @@ class InTheLoop:
             inputs["applied"] = computer.applied[0]
         leaves = jax.tree.leaves([inputs[name] for name in self.board.inputs])
         row = jnp.concatenate([now.t[None], *map(jnp.ravel, leaves)])
-        after, out, status = self.library.called(state, row, self._changed_parameters(parts))
+        after, out, status = self.library.step_in_jax(state, row, self._changed_parameters(parts))
         has_length = period.length > 0.0
         after = jnp.where(has_length, after, state)
-        other = SAMPLES.index("other")
-        ended = jnp.where((status >= 0) & (status < other), status, other)
-        counts = counts.at[ended].add(has_length.astype(counts.dtype))
-        outputs = self._trees(self.board.outputs, out, 0)
-        memory = self._trees(self.board.state, after, 3)
+        other_index = SAMPLE_STATUSES.index("other")
+        counted_index = jnp.where((status >= 0) & (status < other_index), status, other_index)
+        counts = counts.at[counted_index].add(has_length.astype(counts.dtype))
+        outputs = self._unpack_trees(self.board.outputs, out, 0)
+        memory = self._unpack_trees(self.board.state, after, 3)
         channels = outputs.get("wheel_torque", outputs.get("torque"))
-        seen = self.board.model.state_of(memory)
+        measured = self.board.model.state_of(memory)
         decision = Decision(parts.reference(now.t), outputs["d_hat"], outputs["command"], outputs["s"],
-                            parts.plant.velocity(seen), channels)  # fmt: skip
-        kept = memory["observer"], memory["law"], computer.applied, memory.get("command_filter")
-        return decision, Computer((sensing, after, counts), seen, *kept)
+                            parts.plant.velocity(measured), channels)  # fmt: skip
+        memories = memory["observer"], memory["law"], computer.applied, memory.get("command_filter")
+        return decision, Computer((sensing, after, counts), measured, *memories)
 
     def statuses(self, computer: Computer) -> dict[str, Any]:
         """Return the number of samples of a run with each status."""
-        return dict(zip(SAMPLES, computer.sensors[2], strict=True))
+        return dict(zip(SAMPLE_STATUSES, computer.sensors[2], strict=True))
 
     def _changed_parameters(self, parts: Parts) -> Any:
         """Return the parameters (columns,) that a trial changes, with NaN for unchanged ones."""
         changed = jnp.full(len(self.library.columns["params"]), jnp.nan)
-        drawn, nominal = (dict(jax.tree_util.tree_leaves_with_path(known(of))) for of in (parts, self.nominal))
-        for path, at in self._columns.items():
+        trees = (board_parameters(source) for source in (parts, self.nominal))
+        drawn, nominal = (dict(jax.tree_util.tree_leaves_with_path(tree)) for tree in trees)
+        for path, start in self._columns.items():
             value = jnp.where(jnp.any(drawn[path] != nominal[path]), jnp.ravel(drawn[path]), jnp.nan)
-            changed = changed.at[at : at + value.size].set(value)
+            changed = changed.at[start : start + value.size].set(value)
         return changed
 
-    def _with(self, state: Any, name: str, value: Any) -> Any:
-        at = self.library.columns["state"].index(name + "[0]" * value.ndim)
-        return state.at[at : at + value.size].set(jnp.ravel(value))
+    def _set_columns(self, state: Any, name: str, value: Any) -> Any:
+        start = self.library.columns["state"].index(name + "[0]" * value.ndim)
+        return state.at[start : start + value.size].set(jnp.ravel(value))
 
-    def _trees(self, shapes: dict[str, Any], row: Any, at: int) -> dict[str, Any]:
+    def _unpack_trees(self, shapes: dict[str, Any], row: Any, start: int) -> dict[str, Any]:
         """Return named trees from the numbers of a row, starting at an index."""
         trees = {}
         for name, shape in shapes.items():
-            leaves, tree = jax.tree.flatten(shape)
+            leaves, structure = jax.tree.flatten(shape)
             values = []
             for leaf in leaves:
-                values.append(row[at : at + leaf.size].reshape(leaf.shape).astype(leaf.dtype))
-                at += leaf.size
-            trees[name] = jax.tree.unflatten(tree, values)
+                values.append(row[start : start + leaf.size].reshape(leaf.shape).astype(leaf.dtype))
+                start += leaf.size
+            trees[name] = jax.tree.unflatten(structure, values)
         return trees

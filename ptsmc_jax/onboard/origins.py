@@ -11,17 +11,17 @@ from typing import Any, NamedTuple
 import jax
 
 JAX = Path(jax.__file__).parent
-FOREIGN = ("jaxtyping", "beartype", "<")  # parts of file names of wrappers, whose stack frames are ignored
+WRAPPERS = ("jaxtyping", "beartype", "<")  # parts of file names of wrappers, whose stack frames are ignored
 LIBRARY = Path(__file__).parents[1]
-HELPERS = ("numerics/", "onboard/")  # folders whose functions get no heading in the C
+HELPER_FOLDERS = ("numerics/", "onboard/")  # folders whose functions get no heading in the C
 
 
 class Section(NamedTuple):
     """A function of the source."""
 
     name: str
-    place: str  # path of its file for a heading
-    about: str  # the first sentence of its docstring
+    path: str  # path of its file for a heading
+    summary: str  # the first sentence of its docstring
 
 
 class Frame(NamedTuple):
@@ -32,93 +32,94 @@ class Frame(NamedTuple):
     span: tuple[int, int, int, int]  # position of the expression: first line and column, last line and column
 
 
-def frames(eqn: Any) -> list[Frame]:
+def stack_frames(eqn: Any) -> list[Frame]:
     """Return the stack frames of an equation, the innermost first, without frames of JAX."""
     trace = eqn.source_info.traceback
-    codes, at = ((), ()) if trace is None else trace.raw_frames()
+    code_objects, instructions = ((), ()) if trace is None else trace.raw_frames()
     calls = []
-    for code, where in zip(codes, at, strict=True):
-        if not _foreign(code.co_filename):
-            calls.append(Frame(code.co_filename, code.co_qualname, _spans(code)[where // 2]))
+    for code, instruction in zip(code_objects, instructions, strict=True):
+        if not _is_foreign(code.co_filename):
+            calls.append(Frame(code.co_filename, code.co_qualname, _instruction_spans(code)[instruction // 2]))
     return calls
 
 
 @functools.cache
-def _foreign(file: str) -> bool:
-    return Path(file).is_relative_to(JAX) or any(part in file for part in FOREIGN)
+def _is_foreign(file: str) -> bool:
+    return Path(file).is_relative_to(JAX) or any(part in file for part in WRAPPERS)
 
 
 @functools.cache
-def _spans(code: Any) -> list[tuple[int, int, int, int]]:
+def _instruction_spans(code: Any) -> list[tuple[int, int, int, int]]:
     return [(a or 0, c or 0, b or 0, d or 0) for a, b, c, d in code.co_positions()]
 
 
-def line(calls: list[Frame]) -> str:
+def call_line(calls: list[Frame]) -> str:
     """Return file and line of a call for an error, if possible in the user's code; empty if unknown."""
-    frame = _written(calls)
+    frame = _frame_for_error(calls)
     return "" if frame is None else f"{frame.file}:{frame.span[0]}"
 
 
-def function(calls: list[Frame]) -> str:
+def called_function(calls: list[Frame]) -> str:
     """Return the function that the source calls there, such as "jnp.linalg.solve"; empty if it is not a call."""
-    frame = _written(calls)
-    tree = None if frame is None else _tree(frame.file)
+    frame = _frame_for_error(calls)
+    tree = None if frame is None else _syntax_tree(frame.file)
     if frame is None or tree is None:
         return ""
-    found = (node.func for node in ast.walk(tree) if isinstance(node, ast.Call) and _span(node) == frame.span)
-    return next(map(ast.unparse, found), "")
+    functions = (node.func for node in ast.walk(tree) if isinstance(node, ast.Call) and _span(node) == frame.span)
+    return next(map(ast.unparse, functions), "")
 
 
-def _written(calls: list[Frame]) -> Frame | None:
+def _frame_for_error(calls: list[Frame]) -> Frame | None:
     """Return the frame that an error names: the innermost frame in the user's code, if the user's code made the call.
 
     Otherwise it is the innermost frame of the library. The result is None without frames.
     """
-    users = [frame for frame in calls if not Path(frame.file).is_relative_to(LIBRARY)]
-    inside = users if users and calls[0] in users else calls  # a user's call of the library is not the cause
-    return inside[0] if inside else None
+    user_frames = [frame for frame in calls if not Path(frame.file).is_relative_to(LIBRARY)]
+    # if the user's code only calls the library, the library is the cause
+    candidates = user_frames if user_frames and calls[0] in user_frames else calls
+    return candidates[0] if candidates else None
 
 
-def section(found: list[Frame]) -> Section | None:
-    """Return the section of an equation: the innermost function that is not in `HELPERS`."""
-    for frame in found:
-        place, name = _place(frame.file), _name(frame.name)
-        if place and name:
-            return Section(name, place, _about(frame.file, frame.span[0]))
+def find_section(calls: list[Frame]) -> Section | None:
+    """Return the section of an equation: the innermost function that is not in `HELPER_FOLDERS`."""
+    for frame in calls:
+        path, name = _heading_path(frame.file), _qualified_name(frame.name)
+        if path and name:
+            return Section(name, path, _function_summary(frame.file, frame.span[0]))
     return None
 
 
 @functools.cache
-def _place(file: str) -> str:
+def _heading_path(file: str) -> str:
     """Return the path of a file for a heading; empty if its functions are helpers."""
     path = Path(file)
     if not path.is_relative_to(LIBRARY):
         return path.name
-    helps = path.relative_to(LIBRARY).as_posix().startswith(HELPERS)
-    return "" if helps else path.relative_to(LIBRARY.parent).as_posix()
+    is_helper = path.relative_to(LIBRARY).as_posix().startswith(HELPER_FOLDERS)
+    return "" if is_helper else path.relative_to(LIBRARY.parent).as_posix()
 
 
-def title(found: list[Frame]) -> str:
+def value_name(calls: list[Frame]) -> str:
     """Return the name of an equation's value in the source; empty if it has none."""
-    which: int | None = None
-    for frame in found:
-        where = _values(frame.file).get(frame.span)
-        if where is None:
+    tuple_index: int | None = None
+    for frame in calls:
+        use = _expression_uses(frame.file).get(frame.span)
+        if use is None:
             return ""
-        kind, names, index = where
+        kind, names, index = use
         if kind == "return":
-            which = index if index is not None else which
+            tuple_index = index if index is not None else tuple_index
             continue
         if index is not None:
             return names[index]
         if len(names) == 1:
             return names[0]
-        return names[which] if which is not None and which < len(names) else ""
+        return names[tuple_index] if tuple_index is not None and tuple_index < len(names) else ""
     return ""
 
 
 @functools.cache
-def _tree(file: str) -> ast.Module | None:
+def _syntax_tree(file: str) -> ast.Module | None:
     try:
         return ast.parse(Path(file).read_bytes())
     except (OSError, SyntaxError, ValueError):
@@ -126,19 +127,19 @@ def _tree(file: str) -> ast.Module | None:
 
 
 @functools.cache
-def _values(file: str) -> dict[tuple[int, int, int, int], tuple[str, tuple[str, ...], int | None]]:
+def _expression_uses(file: str) -> dict[tuple[int, int, int, int], tuple[str, tuple[str, ...], int | None]]:
     """Return the use of each expression by its position: ("assign" or "return", names, index in a tuple)."""
     uses: dict[tuple[int, int, int, int], tuple[str, tuple[str, ...], int | None]] = {}
-    tree = _tree(file)
+    tree = _syntax_tree(file)
     for node in ast.walk(tree) if tree is not None else ():
         if isinstance(node, ast.Call):  # SurfaceGains(c=.., e=..)
-            uses |= {_span(word.value): ("assign", (word.arg,), None) for word in node.keywords if word.arg}
+            uses |= {_span(keyword.value): ("assign", (keyword.arg,), None) for keyword in node.keywords if keyword.arg}
         if isinstance(node, ast.Return) and node.value is not None:
             kind, names, value = "return", (), node.value
         elif isinstance(node, ast.Assign) and len(node.targets) == 1:
             target, value, kind = node.targets[0], node.value, "assign"
-            several = target.elts if isinstance(target, ast.Tuple) else [target]
-            names = tuple(one.id if isinstance(one, ast.Name) else "" for one in several)
+            targets = target.elts if isinstance(target, ast.Tuple) else [target]
+            names = tuple(element.id if isinstance(element, ast.Name) else "" for element in targets)
         else:
             continue
         if isinstance(value, ast.Tuple):
@@ -155,34 +156,34 @@ def _span(node: Any) -> tuple[int, int, int, int]:
 
 
 @functools.cache
-def _name(name: str) -> str:
+def _qualified_name(name: str) -> str:
     return re.sub(r"\.?<(locals|lambda|genexpr|listcomp)>", "", name).strip(".")
 
 
 @functools.cache
-def _about(file: str, at: int) -> str:
-    tree, best = _tree(file), None
+def _function_summary(file: str, line_number: int) -> str:
+    tree, innermost = _syntax_tree(file), None
     for node in ast.walk(tree) if tree is not None else ():
-        if isinstance(node, ast.FunctionDef) and node.lineno <= at <= (node.end_lineno or 0):
-            best = node if best is None or node.lineno >= best.lineno else best
-    text = None if best is None else ast.get_docstring(best)
+        if isinstance(node, ast.FunctionDef) and node.lineno <= line_number <= (node.end_lineno or 0):
+            innermost = node if innermost is None or node.lineno >= innermost.lineno else innermost
+    text = None if innermost is None else ast.get_docstring(innermost)
     return "" if not text else " ".join(text.split("\n\n")[0].split())
 
 
-def documents(part: Any, until: tuple[type, ...]) -> list[tuple[str, str]]:
+def class_docstrings(part: Any, common_bases: tuple[type, ...]) -> list[tuple[str, str]]:
     """Return (class, docstring) of a part's class and its base classes, up to the common ones."""
-    texts = []
+    docstrings = []
     for cls in type(part).__mro__:
-        if cls in until or cls.__module__ in ("builtins", "abc", "typing"):
+        if cls in common_bases or cls.__module__ in ("builtins", "abc", "typing"):
             continue
         text = cls.__dict__.get("__doc__")
-        if text and not text.startswith(f"{cls.__name__}(") and text not in [known for _, known in texts]:
-            texts.append((cls.__name__, inspect.cleandoc(text)))
-    return texts
+        if text and not text.startswith(f"{cls.__name__}(") and text not in [known for _, known in docstrings]:
+            docstrings.append((cls.__name__, inspect.cleandoc(text)))
+    return docstrings
 
 
 @functools.cache
-def comments(cls: type) -> dict[str, str]:
+def field_comments(cls: type) -> dict[str, str]:
     """Return the comment beside each field of a class: meaning and unit."""
     meanings: dict[str, str] = {}
     for base in reversed(cls.__mro__):
@@ -190,16 +191,16 @@ def comments(cls: type) -> dict[str, str]:
             source = textwrap.dedent(inspect.getsource(base))
         except (OSError, TypeError):
             continue
-        above: list[str] = []
+        lines_above: list[str] = []
         for text in source.splitlines():
-            alone = re.match(r"\s+#\s?(.*)$", text)
+            comment_line = re.match(r"\s+#\s?(.*)$", text)
             field = re.match(r"\s+(\w+)\s*:\s*[^#]*?(?:#\s*(.*))?$", text)
-            if alone:
-                above.append(alone[1])
+            if comment_line:
+                lines_above.append(comment_line[1])
                 continue
             if field and not text.strip().endswith(":"):
-                meaning = field[2] or " ".join(above)
+                meaning = field[2] or " ".join(lines_above)
                 if meaning:
                     meanings[field[1]] = meaning.strip()
-            above = []
+            lines_above = []
     return meanings

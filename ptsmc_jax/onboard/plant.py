@@ -10,7 +10,7 @@ from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.observers.none import NoObserver
 from ptsmc_jax.onboard import derived
-from ptsmc_jax.onboard.board import Board, Given, Stage
+from ptsmc_jax.onboard.board import Board, Stage, Values
 from ptsmc_jax.onboard.fmu import FILTER_STATE
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.computer import Computer, Decision, Software
@@ -31,41 +31,44 @@ def plant_board(parts: Parts, dispersion: Dispersion, controller: Board) -> Boar
         dispersion: the dispersions. C computes those of a trial from the parameters `seed` and `trial`.
         controller: the flight computer of the scenario. The plant has outputs with the names of its inputs.
     """
-    numbers = {"seed": jnp.uint32(0), "trial": jnp.uint32(0), "period": parts.period, "t_end": parts.t_end}
+    run_numbers = {"seed": jnp.uint32(0), "trial": jnp.uint32(0), "period": parts.period, "t_end": parts.t_end}
     nominal = _plant_parts(parts)
-    trial = _plant_parts(_of_trial(parts, dispersion, numbers | nominal))
-    parameters = numbers | nominal | {"drawn": jax.tree.map(lambda leaf: jnp.array(leaf, copy=True), trial)}
-    command = "command" if parts.actuators.ideal else "sent_torque"
+    trial = _plant_parts(_draw_trial(parts, dispersion, run_numbers | nominal))
+    nominal_parameters = run_numbers | nominal | {"drawn": jax.tree.map(lambda leaf: jnp.array(leaf, copy=True), trial)}
+    command = "command" if parts.actuators.is_ideal else "sent_torque"
     always = ("period", "seed", "trial")
-    computer = Board(parts.plant, parameters, inputs={command: controller.outputs[command]}, always=always)
+    inputs = {command: controller.outputs[command]}
+    computer = Board(parts.plant, nominal_parameters, inputs, always_exported=always)
 
-    def draw(given: Given) -> Given:
-        return given | {"drawn": _plant_parts(_of_trial(parts, dispersion, given))}
+    def draw(parameters: Values) -> Values:
+        return parameters | {"drawn": _plant_parts(_draw_trial(parts, dispersion, parameters))}
 
-    def begin(given: Given, _: Given) -> Given:
-        trial = _assembled(parts, given, given["drawn"])
-        vehicle, state = _begin(trial, given["seed"], given["trial"])
-        filtered = trial.sensors.remembered(state.computer.sensors)
-        return _written(trial, state, jnp.int32(0), controller) | {
+    def begin(parameters: Values, _: Values) -> Values:
+        trial = _replace_parts(parts, parameters, parameters["drawn"])
+        vehicle, state = _start_plant(trial, parameters["seed"], parameters["trial"])
+        filtered = trial.sensors.filter_state(state.computer.sensors)
+        return _state_and_outputs(trial, state, jnp.int32(0), controller) | {
             "now.keys": (vehicle.walk_key, vehicle.jitter_key),
             **{f"out.initial_{name}": filtered[name] for name in FILTER_STATE
                if name in filtered and name in controller.state},
         }  # fmt: skip
 
-    def advance(given: Given, values: Given) -> Given:
-        trial, sample, none = _assembled(parts, given, given["drawn"]), values["before.sample"], jnp.zeros(())
-        software, bound = _commanding(values["in." + command]), trial.observer.error_bound()
-        vehicle = Vehicle(trial, software, bound, none, none, *values["before.keys"])
-        tick = Tick(_period(trial, sample), none, jnp.asarray(False))
+    def advance(parameters: Values, values: Values) -> Values:
+        trial, sample = _replace_parts(parts, parameters, parameters["drawn"]), values["before.sample"]
+        zero = jnp.zeros(())
+        software, bound = _constant_command_software(values["in." + command]), trial.observer.error_bound()
+        vehicle = Vehicle(trial, software, bound, zero, zero, *values["before.keys"])
+        tick = Tick(_period_ticks(trial, sample), zero, jnp.asarray(False))
         after, _ = control_period(vehicle, values["before.plant"], tick)
-        return _written(trial, after, sample + 1, controller)
+        return _state_and_outputs(trial, after, sample + 1, controller)
 
     computer.rules.append(draw)
-    written = jax.eval_shape(lambda given: begin(given, {}), parameters)
-    computer.outputs = {name.removeprefix("out."): v for name, v in written.items() if name.startswith("out.")}
-    computer.state = {name.removeprefix("now."): v for name, v in written.items() if name.startswith("now.")}
-    computer.about = controller.about | _ABOUT | {"true_disturbance": f"disturbance at this sample{controller.unit}"}
-    computer.about |= {f"true_{name}": f"{text}, without errors" for name, text in parts.plant.signals.items()}
+    values_at_start = jax.eval_shape(lambda parameters: begin(parameters, {}), nominal_parameters)
+    computer.outputs = {name.removeprefix("out."): v for name, v in values_at_start.items() if name.startswith("out.")}
+    computer.state = {name.removeprefix("now."): v for name, v in values_at_start.items() if name.startswith("now.")}
+    computer.meanings = controller.meanings | _MEANINGS
+    computer.meanings["true_disturbance"] = f"disturbance at this sample{controller.unit}"
+    computer.meanings |= {f"true_{name}": f"{text}, without errors" for name, text in parts.plant.signals.items()}
     computer.stages = [
         Stage("begin", "The plant at the first sample: dispersions, sensors, first readings.", (), begin),
         Stage("advance", "One control period: actuators, disturbance, motion, then the readings at the next sample.",
@@ -74,7 +77,7 @@ def plant_board(parts: Parts, dispersion: Dispersion, controller: Board) -> Boar
     return computer
 
 
-_ABOUT = {
+_MEANINGS = {
     "seed": "seed of the random numbers",
     "trial": "number of the trial",
     "period": "control period [s]",
@@ -93,25 +96,27 @@ def _plant_parts(parts: Parts) -> dict[str, Any]:
     return {name: getattr(parts, name) for name in PARTS if getattr(parts, name) is not None}
 
 
-def _assembled(parts: Parts, given: Given, picked: Given) -> Parts:
+def _replace_parts(parts: Parts, values: Values, traced: Values) -> Parts:
     """Replace parts of the run by traced values.
 
     Args:
         parts: the nominal parts.
-        given: parameters of the plant by name, for `period` and `t_end` [s].
-        picked: values of the parts in `PARTS`, by name.
+        values: parameters of the plant by name, for `period` and `t_end` [s].
+        traced: values of the parts in `PARTS`, by name.
     """
-    clock = replace(parts.clock, period=given["period"], t_end=given["t_end"])
-    return replace(parts, clock=clock, t_end=given["t_end"], **{name: picked[name] for name in PARTS if name in picked})
+    clock = replace(parts.clock, period=values["period"], t_end=values["t_end"])
+    return replace(
+        parts, clock=clock, t_end=values["t_end"], **{name: traced[name] for name in PARTS if name in traced}
+    )
 
 
-def _of_trial(parts: Parts, dispersion: Dispersion, given: Given) -> Parts:
+def _draw_trial(parts: Parts, dispersion: Dispersion, values: Values) -> Parts:
     """Apply the dispersions of the trial that the parameters `seed` and `trial` select, and align the initial state."""
-    nominal = _assembled(parts, given, given)
+    nominal = _replace_parts(parts, values, values)
     if hasattr(nominal.plant, "with_inertia"):  # the inverse and a gravity gradient follow from the inertia
         nominal = nominal.with_inertia(nominal.plant.inertia, known=False)
-    nominal = replace(nominal, actuators=derived.allocated(nominal.actuators))
-    drawn = dispersion.apply(nominal, given["seed"], given["trial"])
+    nominal = replace(nominal, actuators=derived.with_wheel_allocation(nominal.actuators))
+    drawn = dispersion.apply(nominal, values["seed"], values["trial"])
     drawn = replace(drawn, initial=drawn.aligned_initial)
     if drawn.actuators.wheels is None:
         return drawn
@@ -119,13 +124,13 @@ def _of_trial(parts: Parts, dispersion: Dispersion, given: Given) -> Parts:
     return replace(drawn, actuators=replace(drawn.actuators, torque_limit=None))
 
 
-def _period(parts: Parts, sample: Any) -> Ticks:
+def _period_ticks(parts: Parts, sample: Any) -> Ticks:
     """Return a control period of the flight clock by the number of its sample."""
     t, t_next = (number.astype(float) * parts.period for number in (sample, sample + 1))
     return Ticks(t, t_next, jnp.asarray(False), sample, jnp.ones(()), jnp.asarray(False))
 
 
-def _commanding(command: Any) -> Software:
+def _constant_command_software(command: Any) -> Software:
     """Return flight software that always commands the same input (m,) [N m]."""
     zero = jnp.zeros_like(command)
 
@@ -138,15 +143,15 @@ def _commanding(command: Any) -> Software:
     return Software(boot, decide)
 
 
-def _begin(parts: Parts, seed: Any, trial: Any) -> tuple[Vehicle, State]:
+def _start_plant(parts: Parts, seed: Any, trial: Any) -> tuple[Vehicle, State]:
     """Return the constants of the run, and its state at the first sample."""
-    ticks = jax.tree.map(lambda v: v[None], _period(parts, jnp.int32(0)))
+    ticks = jax.tree.map(lambda v: v[None], _period_ticks(parts, jnp.int32(0)))
     # the plant needs no observer, which may have no counterpart in C
     parts = replace(parts, observer=NoObserver(parts.plant, jnp.zeros(())))
-    return start(parts, ticks, parts.initial, seed, trial, _commanding(jnp.zeros(parts.plant.inputs)))
+    return start(parts, ticks, parts.initial, seed, trial, _constant_command_software(jnp.zeros(parts.plant.inputs)))
 
 
-def _written(parts: Parts, state: State, sample: Any, controller: Board) -> Given:
+def _state_and_outputs(parts: Parts, state: State, sample: Any, controller: Board) -> Values:
     """Return the state and the outputs at a sample, by name, after its readings.
 
     Args:
@@ -155,22 +160,22 @@ def _written(parts: Parts, state: State, sample: Any, controller: Board) -> Give
         sample: number of the sample.
         controller: the flight computer, whose inputs are outputs of the plant.
     """
-    now = _period(parts, sample)
+    now = _period_ticks(parts, sample)
     before = jnp.where(sample > 0, now.t - (sample - 1).astype(float) * parts.period, 0.0)
     visible = parts.plant.visible(state.x)
-    named, memory = parts.sensors.inputs(state.computer.sensors, visible, now, before, state.star_x)
-    named |= {"wheel_momentum": state.actuators.h, "acting": state.actuators.v, "applied": state.applied[0],
+    signals, memory = parts.sensors.inputs(state.computer.sensors, visible, now, before, state.star_x)
+    signals |= {"wheel_momentum": state.actuators.h, "acting": state.actuators.v, "applied": state.applied[0],
               "reference": parts.reference(now.t)}  # fmt: skip
     d = parts.disturbance(now.t if state.offset is None else now.t + state.offset, state.x)
-    true = parts.plant.signals_of(visible) | {
+    true_values = parts.plant.signals_of(visible) | {
         "disturbance": d if state.walk is None else d + state.walk,
         "torque": state.torque,
     }
-    outputs = {name: jax.tree.map(lambda v, of: v.astype(of.dtype), named[name], shape)
+    outputs = {name: jax.tree.map(lambda v, like: v.astype(like.dtype), signals[name], shape)
                for name, shape in controller.inputs.items()}  # fmt: skip
-    outputs |= {f"true_{name}": value for name, value in true.items()}
+    outputs |= {f"true_{name}": value for name, value in true_values.items()}
     if hasattr(memory, "estimate"):  # the plant leaves out the filter, which is in the flight computer
         memory = memory._replace(estimate=None)
     applied = None if state.computer.applied is None else (state.applied[0], None)
-    kept = state._replace(computer=state.computer._replace(sensors=memory, applied=applied))
-    return {"now.plant": kept, "now.sample": sample} | {f"out.{name}": value for name, value in outputs.items()}
+    plant_state = state._replace(computer=state.computer._replace(sensors=memory, applied=applied))
+    return {"now.plant": plant_state, "now.sample": sample} | {f"out.{name}": value for name, value in outputs.items()}

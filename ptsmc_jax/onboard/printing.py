@@ -13,7 +13,7 @@ from ptsmc_jax.onboard.expressions import BOOL, REAL, Block, Node, Region
 
 FILES = Path(__file__).parent / "files"
 WIDTH = 110  # characters of a line
-LONGEST = 90  # characters of an expression inside another expression
+MAX_INLINE_LENGTH = 90  # characters of an expression inside another expression
 RESERVED = set(
     "auto break case char const continue default do double else enum extern float for goto if inline int long register "
     "restrict return short signed sizeof static struct switch typedef union unsigned void volatile while real R in p d "
@@ -21,19 +21,21 @@ RESERVED = set(
     "threefry erf_inv".split()
 )
 # functions of math.h, which a variable of the same name would hide
-MATH = ("acos acosh asin asinh atan atan2 atanh cbrt ceil cos cosh erf erfc exp exp2 expm1 fabs floor fmod lgamma log "
-        "log1p nextafter pow rint round sin sinh sqrt tan tanh")  # fmt: skip
-RESERVED |= {name + end for name in MATH.split() for end in ("", "f")}
+MATH_FUNCTIONS = (
+    "acos acosh asin asinh atan atan2 atanh cbrt ceil cos cosh erf erfc exp exp2 expm1 fabs floor fmod lgamma log "
+    "log1p nextafter pow rint round sin sinh sqrt tan tanh"
+)
+RESERVED |= {name + end for name in MATH_FUNCTIONS.split() for end in ("", "f")}
 INFIX = {"add": ("+", 12), "sub": ("-", 12), "mul": ("*", 13), "div": ("/", 13), "rem": ("%", 13), "lt": ("<", 10),
          "le": ("<=", 10), "gt": (">", 10), "ge": (">=", 10), "eq": ("==", 9), "ne": ("!=", 9), "and": ("&&", 5),
          "or": ("||", 4)}  # fmt: skip
-PLAIN = {"max": "larger", "min": "smaller", "sign": "sign_of"}  # helper functions in C, by operation
-CALLED = ("threefry", "erf_inv")  # further helper functions in C, with the names of their operations
+HELPER_NAMES = {"max": "larger", "min": "smaller", "sign": "sign_of"}  # helper functions in C, by operation
+HELPER_OPERATIONS = ("threefry", "erf_inv")  # further helper functions in C, with the names of their operations
 # integer types: format of a constant, and the smallest real number that is too large for the type
-WHOLE = {"int32_t": ("{}", "2147483648"), "int64_t": ("{}", "9223372036854775808.0"),
+INTEGER_TYPES = {"int32_t": ("{}", "2147483648"), "int64_t": ("{}", "9223372036854775808.0"),
          "uint32_t": ("{}u", "4294967296")}  # fmt: skip
 ATOMS = ("constant", "place", "variable", "index", "table")
-ATOM, UNARY, CHOICE = 20, 14, 3  # operator precedences in C: no operator, unary operator, ?:
+ATOM, UNARY, CONDITIONAL = 20, 14, 3  # operator precedences in C: no operator, unary operator, ?:
 
 
 def _integer_limits(kind: str) -> tuple[str, str]:
@@ -47,35 +49,36 @@ def _suffix(kind: str) -> str:
     return {REAL: "", BOOL: "_int32"}.get(kind, f"_{kind.removesuffix('_t')}")
 
 
-def _helpers() -> dict[str, str]:
+def _read_helpers() -> dict[str, str]:
     """Return the C helper functions by name; an exported file contains those that it calls."""
     text = [(FILES / "helpers.c").read_text(encoding="utf-8")]
     integers = Template((FILES / "integers.c").read_text(encoding="utf-8"))
-    for kind, (_, beyond) in WHOLE.items():
+    for kind, (_, beyond) in INTEGER_TYPES.items():
         low, high = _integer_limits(kind)
         sign = "x > 0" if low == "0" else "(x > 0) - (x < 0)"
         values = {"kind": kind, "suffix": _suffix(kind), "sign": sign, "low": low, "high": high, "beyond": beyond}
         text.append(integers.substitute(values))
     functions = "\n".join(text).split("\n\n")
-    return {re.findall(r"^static \w+ (\w+)\(", one, re.MULTILINE)[0]: f"{one.rstrip()}\n" for one in functions}
+    names = (re.findall(r"^static \w+ (\w+)\(", function, re.MULTILINE)[0] for function in functions)
+    return {name: f"{function.rstrip()}\n" for name, function in zip(names, functions, strict=True)}
 
 
-HELPERS = _helpers()
+HELPERS = _read_helpers()
 
 
-def number(value: Any, kind: str) -> str:
+def format_constant(value: Any, kind: str) -> str:
     """Return a constant in C."""
     if kind == BOOL:
         return "1" if value else "0"
     if kind != REAL:
-        least = kind[0] == "i" and value == -(2 ** (int(kind[3:5]) - 1))
-        return _integer_limits(kind)[0] if least else WHOLE[kind][0].format(int(value))
+        is_lowest = kind[0] == "i" and value == -(2 ** (int(kind[3:5]) - 1))
+        return _integer_limits(kind)[0] if is_lowest else INTEGER_TYPES[kind][0].format(int(value))
     if value != value:
         return "R(NAN)"
     if value in (float("inf"), float("-inf")):
         return "R(INFINITY)" if value > 0 else "R(-INFINITY)"
-    whole = value == int(value) and abs(value) < 1e15 and str(value) != "-0.0"
-    short = str(int(value)) if whole else repr(value)
+    is_whole = value == int(value) and abs(value) < 1e15 and str(value) != "-0.0"
+    short = str(int(value)) if is_whole else repr(value)
     return f"R({short})"
 
 
@@ -87,24 +90,24 @@ def c_type(kind: str) -> str:
 class Printer:
     """Prints the statements of one C function."""
 
-    def __init__(self, taken: Iterable[str] = ()):
+    def __init__(self, taken_names: Iterable[str] = ()):
         self.names: dict[int, str] = {}  # C names of the variables, by id of the node
         self.bases: dict[int, str] = {}  # first parts of these names, by id of the `Title`
-        self.taken = RESERVED | set(taken)
-        self.uses: Counter[int] = Counter()
+        self.taken_names = RESERVED | set(taken_names)
+        self.use_counts: Counter[int] = Counter()
         self.nodes: dict[int, Node] = {}
-        self.kept: set[int] = set()
+        self.with_variable: set[int] = set()
         self.lengths: dict[int, int] = {}  # approximate length of the text of each expression
         self.counts: Counter[str] = Counter()
         self.section: Any = None
         self.count = 0
-        self.entries = 0  # number of entries of the tables that counted loops read
-        self.open = False  # whether a loop has an unknown number of passes; `counts` has one pass of it
+        self.table_entries = 0  # number of entries of the tables that counted loops read
+        self.has_open_loop = False  # whether a loop has an unknown number of passes; `counts` has one pass of it
 
     @property
     def variables(self) -> int:
         """Largest number of variables, including the entries of tables."""
-        return len(self.names) + self.entries
+        return len(self.names) + self.table_entries
 
     def body(self, block: Block, outputs: Sequence[tuple[str, Node]], returned: Node | None = None) -> list[str]:
         """Return the lines of a function body in C.
@@ -115,237 +118,239 @@ class Printer:
             returned: value of the return statement, or None without one.
         """
         for node in [*(node for _, node in outputs), *([] if returned is None else [returned])]:
-            self._use(node)
+            self._count_use(node)
         for node in sorted(self.nodes.values(), key=lambda node: node.serial):
             self.lengths[id(node)] = 8 if node.op in ATOMS else 3 + sum(self.lengths[id(arg)] for arg in node.args)
-            if self._alone(node):
-                self.kept.add(id(node))
+            if self._needs_variable(node):
+                self.with_variable.add(id(node))
                 self.lengths[id(node)] = 8
         indent = "    "
-        lines = self._block(block, indent)
+        lines = self._print_block(block, indent)
         if outputs and self.section is not None:
             lines.append("")
-        lines += [line for place, node in outputs for line in wrapped(f"{place} = {self.text(node)};", indent)]
-        return lines if returned is None else [*lines, *wrapped(f"return {self.text(returned)};", indent)]
+        lines += [line for place, node in outputs for line in wrap_statement(f"{place} = {self.text(node)};", indent)]
+        return lines if returned is None else [*lines, *wrap_statement(f"return {self.text(returned)};", indent)]
 
     # nodes that are needed, and nodes that get a variable
 
-    def _use(self, node: Node) -> None:
-        first = id(node) not in self.nodes
-        self.uses[id(node)] += 1
+    def _count_use(self, node: Node) -> None:
+        is_new = id(node) not in self.nodes
+        self.use_counts[id(node)] += 1
         self.nodes[id(node)] = node
-        if not first:
+        if not is_new:
             return
         for arg in node.args:
-            self._use(arg)
+            self._count_use(arg)
         if node.op == "region":
-            self._use_region(node.value)
+            self._count_region_uses(node.value)
 
-    def _use_region(self, region: Region) -> None:
+    def _count_region_uses(self, region: Region) -> None:
         if region.test is not None:
-            self._use(region.test)
+            self._count_use(region.test)
         for node in (*region.initial, *(entry for _, entries in region.tables for entry in entries)):
-            self._use(node)
+            self._count_use(node)
         for outputs in region.outputs:
             for node in outputs:
-                self._use(node)
+                self._count_use(node)
         if region.kind != "branch":  # the inputs of a loop are computed before it
-            inside = {id(block) for block in region.blocks}
+            block_ids = {id(block) for block in region.blocks}
             for node in list(self.nodes.values()):
                 for arg in node.args:
-                    if id(node.block) in inside and id(arg.block) not in inside:
-                        self.uses[id(arg)] += 1
+                    if id(node.block) in block_ids and id(arg.block) not in block_ids:
+                        self.use_counts[id(arg)] += 1
 
-    def _alone(self, node: Node) -> bool:
+    def _needs_variable(self, node: Node) -> bool:
         if node.op in ATOMS or node.op == "region":
             return False
-        return node.title is not None or self.uses[id(node)] > 1 or self.lengths[id(node)] > LONGEST
+        return node.title is not None or self.use_counts[id(node)] > 1 or self.lengths[id(node)] > MAX_INLINE_LENGTH
 
     # statements
 
-    def _block(self, block: Block, indent: str) -> list[str]:
+    def _print_block(self, block: Block, indent: str) -> list[str]:
         lines: list[str] = []
         for node in block.nodes:
             if id(node) not in self.nodes:
                 continue
             if node.op == "region":
-                lines += self._heading(node, indent)
-                statement = self._branch if node.value.kind == "branch" else self._loop
+                lines += self._section_heading(node, indent)
+                statement = self._print_branch if node.value.kind == "branch" else self._print_loop
                 lines += statement(node.value, indent)
-            elif id(node) in self.kept:
-                lines += self._heading(node, indent)
+            elif id(node) in self.with_variable:
+                lines += self._section_heading(node, indent)
                 text = self.text(node, inside=True)
-                lines += wrapped(f"const {c_type(node.kind)} {self._name(node)} = {text};", indent)
+                lines += wrap_statement(f"const {c_type(node.kind)} {self._variable_name(node)} = {text};", indent)
         return lines
 
-    def _heading(self, node: Node, indent: str) -> list[str]:
+    def _section_heading(self, node: Node, indent: str) -> list[str]:
         section = node.section
         if section is None or section == self.section:
             return []
         self.section = section
-        title = f"{section.name}, {section.place}" + (f": {section.about}" if section.about else "")
-        return ["", *comment(title, indent)]
+        title = f"{section.name}, {section.path}" + (f": {section.summary}" if section.summary else "")
+        return ["", *format_comment(title, indent)]
 
-    def _branch(self, region: Region, indent: str) -> list[str]:
-        live = [id(node) in self.nodes for node in region.results]
-        results = [node for node, on in zip(region.results, live, strict=True) if on]
-        lines = [f"{indent}{c_type(node.kind)} {self._name(node)};" for node in results]
+    def _print_branch(self, region: Region, indent: str) -> list[str]:
+        is_used = [id(node) in self.nodes for node in region.results]
+        results = [node for node, used in zip(region.results, is_used, strict=True) if used]
+        lines = [f"{indent}{c_type(node.kind)} {self._variable_name(node)};" for node in results]
         assert region.test is not None
-        lines += wrapped(f"if ({self.text(region.test)}) {{", indent)
+        lines += wrap_statement(f"if ({self.text(region.test)}) {{", indent)
         for k, (block, outputs) in enumerate(zip(region.blocks, region.outputs, strict=True)):
             if k:
                 lines.append(f"{indent}}} else {{")
             outer = self.section
-            lines += self._block(block, indent + "    ")
-            for node, output, on in zip(region.results, outputs, live, strict=True):
-                if on:
-                    lines += wrapped(f"{self._name(node)} = {self.text(output)};", indent + "    ")
+            lines += self._print_block(block, indent + "    ")
+            for node, output, used in zip(region.results, outputs, is_used, strict=True):
+                if used:
+                    lines += wrap_statement(f"{self._variable_name(node)} = {self.text(output)};", indent + "    ")
             self.section = outer if k == 0 else None
         return [*lines, f"{indent}}}"]
 
-    def _loop(self, region: Region, indent: str) -> list[str]:
+    def _print_loop(self, region: Region, indent: str) -> list[str]:
         inner, lines = indent + "    ", []
         for node, start, result in zip(region.carried, region.initial, region.results, strict=True):
-            node.title, node.part = result.title, result.part
-            self.names[id(result)] = self._name(node)
-            lines += wrapped(f"{c_type(node.kind)} {self._name(node)} = {self.text(start)};", indent)
-        self.entries += sum(len(entries) for _, entries in region.tables) + len(region.rows) * region.length
+            node.title, node.indices = result.title, result.indices
+            self.names[id(result)] = self._variable_name(node)
+            lines += wrap_statement(f"{c_type(node.kind)} {self._variable_name(node)} = {self.text(start)};", indent)
+        self.table_entries += sum(len(entries) for _, entries in region.tables) + len(region.rows) * region.length
         for table, entries in region.tables:
-            listed = ", ".join(self.text(entry) for entry in entries)
-            lines += wrapped(f"const {c_type(table.kind)} {self._name(table)}[{len(entries)}] = {{{listed}}};",
-                                   indent)  # fmt: skip
+            entry_texts = ", ".join(self.text(entry) for entry in entries)
+            declared = f"const {c_type(table.kind)} {self._variable_name(table)}[{len(entries)}]"
+            lines += wrap_statement(f"{declared} = {{{entry_texts}}};", indent)
         for table, _ in region.rows:
-            lines.append(f"{indent}{c_type(table.kind)} {self._name(table)}[{region.length}];")
+            lines.append(f"{indent}{c_type(table.kind)} {self._variable_name(table)}[{region.length}];")
         if region.kind == "count":
             assert region.index is not None
-            k = self._name(region.index)
+            k = self._variable_name(region.index)
             lines.append(f"{indent}for (int {k} = 0; {k} < {region.length}; {k}++) {{")
         else:
-            self.open = True
+            self.has_open_loop = True
             lines.append(f"{indent}for (;;) {{")
-            lines += self._block(region.blocks[0], inner)
-            lines += wrapped(f"if (!({self.text(region.outputs[0][0])})) {{", inner)
+            lines += self._print_block(region.blocks[0], inner)
+            lines += wrap_statement(f"if (!({self.text(region.outputs[0][0])})) {{", inner)
             lines += [f"{inner}    break;", f"{inner}}}"]
-        once = Counter(self.counts)
-        lines += self._block(region.blocks[-1], inner)
-        after = []
+        counts_before = Counter(self.counts)
+        lines += self._print_block(region.blocks[-1], inner)
+        assignments = []
         for node, output in zip(region.carried, region.outputs[-1], strict=False):
             if output is node:
                 continue
-            then = self._fresh(f"{self._name(node)}_next")
-            lines += wrapped(f"const {c_type(node.kind)} {then} = {self.text(output)};", inner)
-            after.append(f"{inner}{self._name(node)} = {then};")
-        for table, which in region.rows:
-            k = self._name(region.index) if region.index is not None else ""
-            lines += wrapped(f"{self._name(table)}[{k}] = {self.text(region.outputs[-1][which])};", inner)
+            next_name = self._unused_name(f"{self._variable_name(node)}_next")
+            lines += wrap_statement(f"const {c_type(node.kind)} {next_name} = {self.text(output)};", inner)
+            assignments.append(f"{inner}{self._variable_name(node)} = {next_name};")
+        for table, column in region.rows:
+            k = self._variable_name(region.index) if region.index is not None else ""
+            result = self.text(region.outputs[-1][column])
+            lines += wrap_statement(f"{self._variable_name(table)}[{k}] = {result};", inner)
         self.section = None
         for op in self.counts:
-            self.counts[op] += (self.counts[op] - once[op]) * max(region.length - 1, 0)
-        return [*lines, *after, f"{indent}}}"]
+            self.counts[op] += (self.counts[op] - counts_before[op]) * max(region.length - 1, 0)
+        return [*lines, *assignments, f"{indent}}}"]
 
     # names
 
-    def _name(self, node: Node) -> str:
+    def _variable_name(self, node: Node) -> str:
         if id(node) not in self.names:
             if node.title is None:
-                what = {"index": "k", "table": "table"}.get(node.op, "a")
+                prefix = {"index": "k", "table": "table"}.get(node.op, "a")
                 self.count += 1
-                self.names[id(node)] = self._fresh(f"{what}{self.count}")
+                self.names[id(node)] = self._unused_name(f"{prefix}{self.count}")
             else:
-                base = self._base(node)
-                self.names[id(node)] = self._fresh(f"{base}_{node.part}" if node.part else base, used=base)
+                base = self._base_name(node)
+                name = f"{base}_{node.indices}" if node.indices else base
+                self.names[id(node)] = self._unused_name(name, allowed=base)
         return self.names[id(node)]
 
-    def _base(self, node: Node) -> str:
+    def _base_name(self, node: Node) -> str:
         assert node.title is not None
         if id(node.title) not in self.bases:
             plain = re.sub(r"\W", "_", node.title.name).strip("_") or "x"
             plain = f"{plain}_" if plain in RESERVED or plain[0].isdigit() else plain
-            self.bases[id(node.title)] = self._fresh(plain)
+            self.bases[id(node.title)] = self._unused_name(plain)
         return self.bases[id(node.title)]
 
-    def _fresh(self, name: str, used: str = "") -> str:
-        found, k = name, ord("b")
-        while found in self.taken and found != used:
-            found, k = f"{name}_{chr(k)}" if k <= ord("z") else f"{name}_{k}", k + 1
-        self.taken.add(found)
-        return found
+    def _unused_name(self, name: str, allowed: str = "") -> str:
+        candidate, k = name, ord("b")
+        while candidate in self.taken_names and candidate != allowed:
+            candidate, k = f"{name}_{chr(k)}" if k <= ord("z") else f"{name}_{k}", k + 1
+        self.taken_names.add(candidate)
+        return candidate
 
     # expressions
 
     def text(self, node: Node, inside: bool = False) -> str:
         """Return the C text of a node: the name of its variable, or its expression if it has none or with `inside`."""
-        return self._text(node, inside)[0]
+        return self._text_and_precedence(node, inside)[0]
 
-    def _text(self, node: Node, inside: bool = False) -> tuple[str, int]:
+    def _text_and_precedence(self, node: Node, inside: bool = False) -> tuple[str, int]:
         if node.op == "constant":
             # C computes the resolution for its own type `real`, which may be float
             is_resolution = node.kind == REAL and node.value == guards.resolution()
-            return "resolution()" if is_resolution else number(node.value, node.kind), ATOM
+            return "resolution()" if is_resolution else format_constant(node.value, node.kind), ATOM
         if node.op == "place":
             return node.value, ATOM
-        if node.op in ATOMS or (id(node) in self.kept and not inside):
-            return self._name(node), ATOM
+        if node.op in ATOMS or (id(node) in self.with_variable and not inside):
+            return self._variable_name(node), ATOM
         self.counts[node.op] += 1
-        if node.op == "add" and node.args[1].op == "neg" and id(node.args[1]) not in self.kept:
+        if node.op == "add" and node.args[1].op == "neg" and id(node.args[1]) not in self.with_variable:
             return self._infix("-", 12, node.args[0], node.args[1].args[0])
         if node.op in INFIX:
             return self._infix(*INFIX[node.op], *node.args)
         if node.op in ("neg", "not"):
-            return ("-" if node.op == "neg" else "!") + self._with_precedence(node.args[0], UNARY + 1), UNARY
+            return ("-" if node.op == "neg" else "!") + self._in_parentheses(node.args[0], UNARY + 1), UNARY
         if node.op == "select":
-            test, yes, no = (self._with_precedence(arg, CHOICE + 1) for arg in node.args)
+            test, yes, no = (self._in_parentheses(arg, CONDITIONAL + 1) for arg in node.args)
             if node.kind == "int64_t":  # two small constants would be int
                 yes, no = (f"INT64_C({text})" if re.fullmatch(r"-?\d+", text) else text for text in (yes, no))
-            return f"{test} ? {yes} : {no}", CHOICE
+            return f"{test} ? {yes} : {no}", CONDITIONAL
         if node.op == "convert" and node.args[0].kind == REAL:  # a cast in C must be in the range of its type
             return f"whole{_suffix(node.kind)}({self.text(node.args[0])})", ATOM
         if node.op == "convert":
-            return f"({c_type(node.kind)}){self._with_precedence(node.args[0], UNARY + 1)}", UNARY
+            return f"({c_type(node.kind)}){self._in_parentheses(node.args[0], UNARY + 1)}", UNARY
         if node.op == "row":  # replaces the first index of a parameter, which is 0
             table, index = node.args
             return table.value.replace("[0]", f"[{self.text(index)}]", 1), ATOM
         if node.op == "entry":
-            return f"{self._name(node.args[0])}[{self.text(node.args[1])}]", ATOM
-        listed = ", ".join(self.text(arg) for arg in node.args)
-        if node.op in PLAIN:
-            return f"{PLAIN[node.op]}{_suffix(node.kind)}({listed})", ATOM
-        if node.op in CALLED:
-            return f"{node.op}({listed})", ATOM
+            return f"{self._variable_name(node.args[0])}[{self.text(node.args[1])}]", ATOM
+        arguments = ", ".join(self.text(arg) for arg in node.args)
+        if node.op in HELPER_NAMES:
+            return f"{HELPER_NAMES[node.op]}{_suffix(node.kind)}({arguments})", ATOM
+        if node.op in HELPER_OPERATIONS:
+            return f"{node.op}({arguments})", ATOM
         if node.op == "abs" and node.kind != REAL:
-            return f"larger{_suffix(node.kind)}({listed}, -{self._with_precedence(node.args[0], UNARY + 1)})", ATOM
+            return f"larger{_suffix(node.kind)}({arguments}, -{self._in_parentheses(node.args[0], UNARY + 1)})", ATOM
         if node.op == "isfinite":
-            return f"isfinite({listed})", ATOM
-        return f"M({'fabs' if node.op == 'abs' else node.op})({listed})", ATOM
+            return f"isfinite({arguments})", ATOM
+        return f"M({'fabs' if node.op == 'abs' else node.op})({arguments})", ATOM
 
-    def _infix(self, sign: str, level: int, a: Node, b: Node) -> tuple[str, int]:
+    def _infix(self, sign: str, precedence: int, a: Node, b: Node) -> tuple[str, int]:
         # parentheses avoid compiler warnings about mixed && and ||, and about comparisons of comparisons
-        mixed = {"&&": "or", "||": "and"}.get(sign)
-        compared = level in (9, 10)
-        left = self._with_precedence(a, ATOM if a.op == mixed else 11 if compared else level)
-        right = self._with_precedence(b, ATOM if b.op == mixed else 11 if compared else level + 1)
-        return f"{left} {sign} {f'({right})' if right.startswith('-') else right}", level
+        other_logical = {"&&": "or", "||": "and"}.get(sign)
+        is_comparison = precedence in (9, 10)
+        left = self._in_parentheses(a, ATOM if a.op == other_logical else 11 if is_comparison else precedence)
+        right = self._in_parentheses(b, ATOM if b.op == other_logical else 11 if is_comparison else precedence + 1)
+        return f"{left} {sign} {f'({right})' if right.startswith('-') else right}", precedence
 
-    def _with_precedence(self, node: Node, level: int) -> str:
-        """Return the C text of a node, in parentheses if the precedence of its operator is below `level`."""
-        text, level_of_node = self._text(node)
-        return text if level_of_node >= level else f"({text})"
+    def _in_parentheses(self, node: Node, lowest: int) -> str:
+        """Return the C text of a node, in parentheses if the precedence of its operator is below `lowest`."""
+        text, precedence = self._text_and_precedence(node)
+        return text if precedence >= lowest else f"({text})"
 
 
-def wrapped(text: str, indent: str) -> list[str]:
+def wrap_statement(text: str, indent: str) -> list[str]:
     """Return the lines of a statement."""
     return textwrap.wrap(text, WIDTH, initial_indent=indent, subsequent_indent=indent + "    ",
                          break_long_words=False, break_on_hyphens=False)  # fmt: skip
 
 
-def inside_comment(text: str) -> str:
+def escape_comment_marks(text: str) -> str:
     """Return the text with /* and */ broken by a space, so that it can be part of a C comment."""
     return text.replace("*/", "* /").replace("/*", "/ *")
 
 
-def comment(text: str, indent: str = "") -> list[str]:
+def format_comment(text: str, indent: str = "") -> list[str]:
     """Return a C comment, wrapped; a line of the text is a paragraph."""
-    lines = [line for paragraph in inside_comment(text).splitlines()
+    lines = [line for paragraph in escape_comment_marks(text).splitlines()
              for line in textwrap.wrap(paragraph, WIDTH - len(indent) - 6, break_long_words=False,
                                        break_on_hyphens=False)]  # fmt: skip
     if len(lines) == 1:

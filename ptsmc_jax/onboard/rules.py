@@ -20,16 +20,16 @@ def power(pool: Pool, x: Node, exponent: int) -> Node:
         x: the base.
         exponent: an integer, which may be negative for a real base.
     """
-    left, found, square = abs(exponent), None, x
-    while left:
-        if left & 1:
-            found = square if found is None else pool.make("mul", found, square, kind=x.kind)
-        left >>= 1
-        if left:
+    remaining, result, square = abs(exponent), None, x
+    while remaining:
+        if remaining & 1:
+            result = square if result is None else pool.make("mul", result, square, kind=x.kind)
+        remaining >>= 1
+        if remaining:
             square = pool.make("mul", square, square, kind=x.kind)
     one = pool.constant(1, x.kind)
-    found = one if found is None else found
-    return pool.make("div", one, found) if exponent < 0 else found
+    result = one if result is None else result
+    return pool.make("div", one, result) if exponent < 0 else result
 
 
 def convert(pool: Pool, kind: str, x: Node) -> Node:
@@ -52,25 +52,25 @@ def convert(pool: Pool, kind: str, x: Node) -> Node:
     return pool.make("convert", x, kind=kind)
 
 
-def _precise(dtype: Any, kind: str) -> str:
+def _check_precision(dtype: Any, kind: str) -> str:
     """Return `kind`, or raise KeyError if the dtype is a floating-point type with fewer digits than numbers in C."""
     if kind == REAL and jnp.finfo(dtype).bits < jnp.finfo(jnp.result_type(float)).bits:
         raise KeyError(dtype)
     return kind
 
 
-def _rounded(pool: Pool, params: Any, kind: str, x: Node) -> Node:
-    known = jnp.finfo(jnp.result_type(float))
-    if params["exponent_bits"] < known.nexp or params["mantissa_bits"] < known.nmant:
+def _reduce_precision(pool: Pool, params: Any, kind: str, x: Node) -> Node:
+    real = jnp.finfo(jnp.result_type(float))
+    if params["exponent_bits"] < real.nexp or params["mantissa_bits"] < real.nmant:
         raise KeyError("reduce_precision")  # a rounding to fewer digits has no rule
     return x
 
 
-def _plain(op: str) -> Callable:
+def _same_operation(op: str) -> Callable:
     return lambda pool, params, kind, *x: pool.make(op, *x, kind=kind)
 
 
-def _logical(op: str) -> Callable:
+def _bool_operation(op: str) -> Callable:
     def rule(pool: Pool, params: Any, kind: str, *x: Node) -> Node:
         if kind != BOOL:
             raise KeyError(op)  # operations on the bits of integers have no rule
@@ -85,52 +85,52 @@ def _xor(pool: Pool, params: Any, kind: str, a: Node, b: Node) -> Node:
     return pool.make("ne", a, b, kind=BOOL)
 
 
-def _select(pool: Pool, params: Any, kind: str, which: Node, *cases: Node) -> Node:
-    if which.kind == BOOL:
+def _select(pool: Pool, params: Any, kind: str, selector: Node, *cases: Node) -> Node:
+    if selector.kind == BOOL:
         no, yes = cases
-        return pool.make("select", which, yes, no, kind=kind)
-    chosen = cases[-1]
+        return pool.make("select", selector, yes, no, kind=kind)
+    result = cases[-1]
     for k in range(len(cases) - 2, -1, -1):
-        test = pool.make("le", which, pool.constant(k, which.kind), kind=BOOL)
-        chosen = pool.make("select", test, cases[k], chosen, kind=kind)
-    return chosen
+        test = pool.make("le", selector, pool.constant(k, selector.kind), kind=BOOL)
+        result = pool.make("select", test, cases[k], result, kind=kind)
+    return result
 
 
 def _round(pool: Pool, params: Any, kind: str, x: Node) -> Node:
-    even = "EVEN" in str(params["rounding_method"]) or int(params["rounding_method"]) == 1
-    return pool.make("rint" if even else "round", x)
+    to_even = "EVEN" in str(params["rounding_method"]) or int(params["rounding_method"]) == 1
+    return pool.make("rint" if to_even else "round", x)
 
 
 def _integer_pow(pool: Pool, params: Any, kind: str, x: Node) -> Node:
     return power(pool, x, params["y"])  # JAX allows negative exponents for real numbers only
 
 
-def _divided(op: str) -> Callable:
+def _division_rule(op: str) -> Callable:
     """Return the rule of a quotient or remainder. As in XLA, k / 0 is -1 and k % 0 is k for integers."""
 
     def rule(pool: Pool, params: Any, kind: str, a: Node, b: Node) -> Node:
         if kind == REAL:
             return pool.make("fmod" if op == "rem" else op, a, b)
-        zero = pool.make("eq", b, pool.constant(0, kind), kind=BOOL)
-        by = pool.make("select", zero, pool.constant(1, kind), b, kind=kind)
-        gone = pool.make("convert", pool.constant(-1, "int32_t"), kind=kind) if op == "div" else a
-        return pool.make("select", zero, gone, pool.make(op, a, by, kind=kind), kind=kind)
+        is_zero = pool.make("eq", b, pool.constant(0, kind), kind=BOOL)
+        divisor = pool.make("select", is_zero, pool.constant(1, kind), b, kind=kind)
+        result_for_zero = pool.make("convert", pool.constant(-1, "int32_t"), kind=kind) if op == "div" else a
+        return pool.make("select", is_zero, result_for_zero, pool.make(op, a, divisor, kind=kind), kind=kind)
 
     return rule
 
 
-def _one_over(pool: Pool, x: Node) -> Node:
+def _reciprocal(pool: Pool, x: Node) -> Node:
     return pool.make("div", pool.constant(1.0, REAL), x)
 
 
 ELEMENTWISE: dict[str, Callable] = {
-    **{op: _plain(op) for op in "add sub mul neg max min abs sign lt le gt ge eq ne sqrt cbrt exp exp2 expm1 log log1p "
-       "lgamma sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh erf erfc erf_inv nextafter floor ceil"
-       .split()},
-    **{f"{op}_to": _plain(op) for op in ("lt", "le", "eq")},
+    **{op: _same_operation(op) for op in "add sub mul neg max min abs sign lt le gt ge eq ne sqrt cbrt exp exp2 "
+       "expm1 log log1p lgamma sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh erf erfc erf_inv "
+       "nextafter floor ceil".split()},
+    **{f"{op}_to": _same_operation(op) for op in ("lt", "le", "eq")},
     "is_finite": lambda pool, params, kind, x: pool.make("isfinite", x, kind=BOOL),
-    "and": _logical("and"), "or": _logical("or"), "not": _logical("not"), "xor": _xor,
-    "add_any": _plain("add"), "integer_pow": _integer_pow, "select_n": _select, "round": _round,
+    "and": _bool_operation("and"), "or": _bool_operation("or"), "not": _bool_operation("not"), "xor": _xor,
+    "add_any": _same_operation("add"), "integer_pow": _integer_pow, "select_n": _select, "round": _round,
     "pow": lambda pool, params, kind, x, y: pool.make("pow", x, convert(pool, REAL, y)),
     "square": lambda pool, params, kind, x: pool.make("mul", x, x, kind=kind),
     "log2": lambda pool, params, kind, x: pool.make(  # XLA scales the natural logarithm, too
@@ -139,15 +139,15 @@ ELEMENTWISE: dict[str, Callable] = {
     "one_minus_square": lambda pool, params, kind, x: pool.make(
         "mul", *(pool.make(op, pool.constant(1, kind), x, kind=kind) for op in ("add", "sub")), kind=kind
     ),
-    "rsqrt": lambda pool, params, kind, x: _one_over(pool, pool.make("sqrt", x)),
+    "rsqrt": lambda pool, params, kind, x: _reciprocal(pool, pool.make("sqrt", x)),
     "clamp": lambda pool, params, kind, low, x, high: pool.make(
         "min", pool.make("max", x, low, kind=kind), high, kind=kind
     ),
-    "div": _divided("div"), "rem": _divided("rem"),
-    "logistic": lambda pool, params, kind, x: _one_over(
+    "div": _division_rule("div"), "rem": _division_rule("rem"),
+    "logistic": lambda pool, params, kind, x: _reciprocal(
         pool, pool.make("add", pool.constant(1.0, REAL), pool.make("exp", pool.make("neg", x)))
     ),
-    "convert_element_type": lambda pool, params, kind, x: convert(pool, _precise(params["new_dtype"], kind), x),
+    "convert_element_type": lambda pool, params, kind, x: convert(pool, _check_precision(params["new_dtype"], kind), x),
     **dict.fromkeys("stop_gradient copy copy_p optimization_barrier pvary".split(), lambda pool, params, kind, x: x),
-    "reduce_precision": _rounded,
+    "reduce_precision": _reduce_precision,
 }  # fmt: skip

@@ -17,19 +17,19 @@ from jax.extend import core
 from ptsmc_jax.batching import components
 from ptsmc_jax.batching.components import object_array
 from ptsmc_jax.batching.dependence import called_jaxpr, open_jaxpr
-from ptsmc_jax.batching.lapack import COUNTED, SHARED
+from ptsmc_jax.batching.lapack import NEVER_BATCHED, SIZE_LIMITED
 from ptsmc_jax.numerics import draws, elementary
 from ptsmc_jax.onboard import origins
 from ptsmc_jax.onboard.control import CONTROL
 from ptsmc_jax.onboard.expressions import BOOL, TYPES, Node, NoRuleError, Pool, Title, kind_of
 from ptsmc_jax.onboard.rules import ELEMENTWISE, KNOWN_FUNCTIONS
 
-MOST_NUMBERS = 4096  # largest number of components of a constant array
-LINEAR_ALGEBRA = COUNTED | SHARED
-PLAIN = (
+MAX_CONSTANTS = 4096  # largest number of components of a constant array
+LINEAR_ALGEBRA = SIZE_LIMITED | NEVER_BATCHED
+ALLOWED_OPERATIONS = (
     "made of sums, products, quotients, powers, roots, elementary functions, comparisons, branches and loops of numbers"
 )
-SMALL_MATRICES = "plain arithmetic, or solve, determinant or smallest_eigenvalue of ptsmc_jax.numerics.matrices"
+ALLOWED_LINEAR_ALGEBRA = "plain arithmetic, or solve, determinant or smallest_eigenvalue of ptsmc_jax.numerics.matrices"
 
 
 class Translator:
@@ -37,52 +37,52 @@ class Translator:
 
     def __init__(self, pool: Pool):
         self.pool = pool
-        self.held: list[origins.Frame] | None = None  # stack frames of the call that is being translated
+        self.outer_frames: list[origins.Frame] | None = None  # stack frames of the call that is being translated
 
     def constant(self, array: Any) -> np.ndarray:
         """Return the components of a constant array."""
         array = array if jnp.issubdtype(jnp.result_type(array), jax.dtypes.extended) else np.asarray(array)
         if not _has_kind(array.dtype):
             raise NoRuleError(f"a constant has the type {array.dtype}, but must have the type {TYPES}")
-        if array.size > MOST_NUMBERS:
-            raise NoRuleError(f"a constant array has {array.size} numbers, but must have at most {MOST_NUMBERS} in C")
+        if array.size > MAX_CONSTANTS:
+            raise NoRuleError(f"a constant array has {array.size} numbers, but must have at most {MAX_CONSTANTS} in C")
         kind = kind_of(array.dtype)
         return object_array(array.shape, (self.pool.constant(v, kind) for v in array.reshape(-1)))
 
     def evaluate(self, closed: Any, args: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Return the components of a jaxpr's outputs, given the components of its inputs."""
         jaxpr, consts = open_jaxpr(closed)
-        known: dict[Any, np.ndarray] = dict(zip(jaxpr.constvars, map(self.constant, consts), strict=True))
-        known |= dict(zip(jaxpr.invars, args, strict=True))
-        spans = [() if self.held else tuple(origins.frames(eqn)[:1]) for eqn in jaxpr.eqns]
+        components_of: dict[Any, np.ndarray] = dict(zip(jaxpr.constvars, map(self.constant, consts), strict=True))
+        components_of |= dict(zip(jaxpr.invars, args, strict=True))
+        spans = [() if self.outer_frames else tuple(origins.stack_frames(eqn)[:1]) for eqn in jaxpr.eqns]
         for k, eqn in enumerate(jaxpr.eqns):
-            values = [self.constant(v.val) if isinstance(v, core.Literal) else known[v] for v in eqn.invars]
-            where = self.held or origins.frames(eqn)
-            outer, self.pool.section = self.pool.section, origins.section(where) or self.pool.section
-            results = self.apply(eqn, values, where)
+            values = [self.constant(v.val) if isinstance(v, core.Literal) else components_of[v] for v in eqn.invars]
+            frames = self.outer_frames or origins.stack_frames(eqn)
+            outer, self.pool.section = self.pool.section, origins.find_section(frames) or self.pool.section
+            results = self.translate_equation(eqn, values, frames)
             self.pool.section = outer
-            if self.held is None and (k + 1 == len(spans) or spans[k + 1] != spans[k]):
-                self._name(results, origins.title(where))
+            if self.outer_frames is None and (k + 1 == len(spans) or spans[k + 1] != spans[k]):
+                self._name_results(results, origins.value_name(frames))
             for variable, result in zip(eqn.outvars, results, strict=True):
-                known[variable] = result
-        return [self.constant(v.val) if isinstance(v, core.Literal) else known[v] for v in jaxpr.outvars]
+                components_of[variable] = result
+        return [self.constant(v.val) if isinstance(v, core.Literal) else components_of[v] for v in jaxpr.outvars]
 
-    def _name(self, results: Sequence[np.ndarray], title: str) -> None:
+    def _name_results(self, results: Sequence[np.ndarray], title: str) -> None:
         if not title or title == "_" or len(results) != 1:
             return
-        group = Title(title)
+        shared_title = Title(title)
         for index in np.ndindex(results[0].shape):
             node: Any = results[0][index]
             if node.title is None and node.op not in ("constant", "place"):
-                node.title, node.part = group, "".join(str(i + 1) for i in index)
+                node.title, node.indices = shared_title, "".join(str(i + 1) for i in index)
 
-    def apply(self, eqn: Any, values: list[np.ndarray], where: list[origins.Frame]) -> list[np.ndarray]:
+    def translate_equation(self, eqn: Any, values: list[np.ndarray], frames: list[origins.Frame]) -> list[np.ndarray]:
         """Return the components of one equation's outputs.
 
         Args:
             eqn: the equation of the trace.
             values: components of its inputs.
-            where: frames of its call stack, for sections and errors.
+            frames: frames of its call stack, for sections and errors.
 
         Raises:
             NoRuleError: if an operation has no counterpart in C.
@@ -91,58 +91,60 @@ class Translator:
         if name == "custom_jvp_call" or name == "custom_vjp_call":
             inner = eqn.params.get("call_jaxpr", eqn.params.get("fun_jaxpr"))
             debug_info = getattr(getattr(inner, "jaxpr", inner), "debug_info", None)
-            known = KNOWN_FUNCTIONS.get(getattr(debug_info, "func_name", ""))
+            c_function = KNOWN_FUNCTIONS.get(getattr(debug_info, "func_name", ""))
             # a user's function may have the same name, so compare the file, too
-            ours = getattr(debug_info, "func_filename", None) == elementary.__file__
-            if known is not None and ours and len(eqn.outvars) == 1:
-                return [self._each(lambda *entry: self.pool.make(known, *entry), values, eqn.outvars[0].aval.shape)]
+            is_from_library = getattr(debug_info, "func_filename", None) == elementary.__file__
+            if c_function is not None and is_from_library and len(eqn.outvars) == 1:
+                shape = eqn.outvars[0].aval.shape
+                return [self._map_entries(lambda *entry: self.pool.make(c_function, *entry), values, shape)]
         if _is_threefry(eqn):
-            word = [self.pool.constant(k, "int32_t") for k in (0, 1)]
-            return [self._each(lambda *entry, k=k: self.pool.make("threefry", *entry, k, kind="uint32_t"),
-                               values, eqn.outvars[0].aval.shape) for k in word]  # fmt: skip
+            word_indices = [self.pool.constant(k, "int32_t") for k in (0, 1)]
+            return [self._map_entries(lambda *entry, k=k: self.pool.make("threefry", *entry, k, kind="uint32_t"),
+                               values, eqn.outvars[0].aval.shape) for k in word_indices]  # fmt: skip
         if inner is not None:
-            outer, self.held = self.held, where
+            outer, self.outer_frames = self.outer_frames, frames
             results = self.evaluate(inner, values)
-            self.held = outer
+            self.outer_frames = outer
             return results
         if not all(_has_kind(v.aval.dtype) for v in eqn.outvars):  # such as random keys and complex numbers
-            raise self.refused(eqn, where)
+            raise self.unsupported_error(eqn, frames)
         if name in CONTROL:
             return CONTROL[name](self, eqn, values)
         if all(node.op == "constant" for value in values for node in value.flat):
             with jax.ensure_compile_time_eval():
-                known = [
-                    jnp.asarray(_numbers(value), v.aval.dtype) for value, v in zip(values, eqn.invars, strict=True)
+                constants = [
+                    jnp.asarray(_constant_values(value), v.aval.dtype)
+                    for value, v in zip(values, eqn.invars, strict=True)
                 ]
-                return [self.constant(found) for found in components.bind(eqn, known)]
-        if _wraps(eqn):
-            raise self.refused(eqn, where)
+                return [self.constant(result) for result in components.bind(eqn, constants)]
+        if _wraps_around(eqn):
+            raise self.unsupported_error(eqn, frames)
         if name in ELEMENTWISE:
-            found = self._elementwise(eqn, values)
-            if found is not None:
-                return [found]
-        if name in _FOLDS and (kind_of(eqn.outvars[0].aval.dtype) == BOOL or name not in _LOGICAL):
+            result = self._elementwise(eqn, values)
+            if result is not None:
+                return [result]
+        if name in _REDUCTIONS and (kind_of(eqn.outvars[0].aval.dtype) == BOOL or name not in _BOOL_REDUCTIONS):
             return [self._reduction(eqn, values[0])]
         if name == "dot_general":
             return [self._contraction(eqn, *values)]
-        if name in _SCANS:
+        if name in _CUMULATIVE:
             return [self._cumulative(eqn, values[0])]
         if name in ("argmax", "argmin"):
-            return [self._place_of_extreme(eqn, values[0])]
-        if name in _MOVES or name in _ADDS:
-            found = self._moved(eqn, values)
-            if found is not None:
-                return found
-        raise self.refused(eqn, where)
+            return [self._index_of_extreme(eqn, values[0])]
+        if name in _MOVES or name in _INDEXED_ADDITIONS:
+            result = self._move_entries(eqn, values)
+            if result is not None:
+                return result
+        raise self.unsupported_error(eqn, frames)
 
-    def refused(self, eqn: Any, where: list[origins.Frame]) -> NoRuleError:
+    def unsupported_error(self, eqn: Any, frames: list[origins.Frame]) -> NoRuleError:
         """Return the error for a primitive without a rule: function and line in the source, and allowed functions."""
-        at, primitive = origins.line(where), eqn.primitive.name
-        allowed = SMALL_MATRICES if primitive in LINEAR_ALGEBRA else PLAIN
-        name = origins.function(where) or primitive
-        return NoRuleError(f"`{name}`{f' ({at})' if at else ''} cannot be written in C, but must be {allowed}")
+        line, primitive = origins.call_line(frames), eqn.primitive.name
+        allowed = ALLOWED_LINEAR_ALGEBRA if primitive in LINEAR_ALGEBRA else ALLOWED_OPERATIONS
+        name = origins.called_function(frames) or primitive
+        return NoRuleError(f"`{name}`{f' ({line})' if line else ''} cannot be written in C, but must be {allowed}")
 
-    def _each(self, rule: Any, values: Sequence[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
+    def _map_entries(self, rule: Any, values: Sequence[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
         flat = [np.broadcast_to(v, shape).reshape(-1) for v in values]
         return object_array(shape, (rule(*entry) for entry in zip(*flat, strict=True)))
 
@@ -151,12 +153,12 @@ class Translator:
         try:
             kind = kind_of(aval.dtype)
             rule = ELEMENTWISE[eqn.primitive.name]
-            return self._each(lambda *entry: rule(self.pool, eqn.params, kind, *entry), values, aval.shape)
+            return self._map_entries(lambda *entry: rule(self.pool, eqn.params, kind, *entry), values, aval.shape)
         except KeyError:  # a type, or a variant of the primitive, that has no counterpart
             return None
 
     def _reduction(self, eqn: Any, value: np.ndarray) -> np.ndarray:
-        op, kind = _FOLDS[eqn.primitive.name], kind_of(eqn.outvars[0].aval.dtype)
+        op, kind = _REDUCTIONS[eqn.primitive.name], kind_of(eqn.outvars[0].aval.dtype)
         return components.reduce_entries(eqn, value, lambda row: self._fold(op, kind, row))
 
     def _fold(self, op: str, kind: str, items: Any) -> Node:
@@ -170,76 +172,77 @@ class Translator:
         kind = kind_of(eqn.outvars[0].aval.dtype)
         total, product = ("or", "and") if kind == BOOL else ("add", "mul")
 
-        def inner(row: np.ndarray, column: np.ndarray) -> Node:
+        def dot_product(row: np.ndarray, column: np.ndarray) -> Node:
             return self._fold(
                 total, kind, (self.pool.make(product, *p, kind=kind) for p in zip(row, column, strict=True))
             )
 
-        return components.contract_entries(eqn, left, right, inner)
+        return components.contract_entries(eqn, left, right, dot_product)
 
     def _cumulative(self, eqn: Any, value: np.ndarray) -> np.ndarray:
-        op, kind = _SCANS[eqn.primitive.name], kind_of(eqn.outvars[0].aval.dtype)
+        op, kind = _CUMULATIVE[eqn.primitive.name], kind_of(eqn.outvars[0].aval.dtype)
         return components.accumulate_entries(eqn, value, lambda *pair: self.pool.make(op, *pair, kind=kind))
 
-    def _place_of_extreme(self, eqn: Any, value: np.ndarray) -> np.ndarray:
+    def _index_of_extreme(self, eqn: Any, value: np.ndarray) -> np.ndarray:
         (axis,), kind = eqn.params["axes"], kind_of(eqn.outvars[0].aval.dtype)
         test = "gt" if eqn.primitive.name == "argmax" else "lt"
         parts = np.moveaxis(value, axis, -1)
 
-        def one(entries: np.ndarray) -> Node:
-            best, at = entries[0], self.pool.constant(0, kind)
+        def index_of_extreme(entries: np.ndarray) -> Node:
+            best, best_index = entries[0], self.pool.constant(0, kind)
             for k, entry in enumerate(entries[1:], 1):
-                beyond = self.pool.make(test, entry, best, kind=BOOL)
-                at = self.pool.make("select", beyond, self.pool.constant(k, kind), at, kind=kind)
-                best = self.pool.make("select", beyond, entry, best, kind=entry.kind)
-            return at
+                is_better = self.pool.make(test, entry, best, kind=BOOL)
+                best_index = self.pool.make("select", is_better, self.pool.constant(k, kind), best_index, kind=kind)
+                best = self.pool.make("select", is_better, entry, best, kind=entry.kind)
+            return best_index
 
-        return object_array(parts.shape[:-1], (one(parts[i]) for i in np.ndindex(*parts.shape[:-1])))
+        return object_array(parts.shape[:-1], (index_of_extreme(parts[i]) for i in np.ndindex(*parts.shape[:-1])))
 
-    def _moved(self, eqn: Any, values: Sequence[np.ndarray]) -> list[np.ndarray] | None:
+    def _move_entries(self, eqn: Any, values: Sequence[np.ndarray]) -> list[np.ndarray] | None:
         """Translate a primitive that only moves or adds array entries, such as slice, gather and scatter.
 
         The indices may be constants or computed. The result is None if the primitive has no rule.
         """
         match eqn.primitive.name:
             case "dynamic_slice":
-                arrays, places = values[:1], values[1:]
+                arrays, indices = values[:1], values[1:]
             case "dynamic_update_slice":
-                arrays, places = values[:2], values[2:]
+                arrays, indices = values[:2], values[2:]
             case "gather" | "scatter" | "scatter-add" | "scatter-sub":
-                arrays, places = values[::2], values[1:2]
+                arrays, indices = values[::2], values[1:2]
             case _:
                 return components.pick_entries(eqn, values)
-        return self._indexed(eqn, values, arrays, places)
+        return self._select_by_index(eqn, values, arrays, indices)
 
-    def _indexed(
-        self, eqn: Any, values: Sequence[np.ndarray], arrays: Sequence[np.ndarray], places: Sequence[np.ndarray]
+    def _select_by_index(
+        self, eqn: Any, values: Sequence[np.ndarray], arrays: Sequence[np.ndarray], indices: Sequence[np.ndarray]
     ) -> list[np.ndarray] | None:
         """Translate a primitive with indices: at a computed index, C selects among the results for all indices."""
-        flat = [node for place in places for node in place.flat]
-        open_places = [node for node in flat if node.op != "constant"]
-        if len({id(node) for node in open_places}) > 1:
+        flat_indices = [node for index_array in indices for node in index_array.flat]
+        computed = [node for node in flat_indices if node.op != "constant"]
+        if len({id(node) for node in computed}) > 1:
             return None
-        if not open_places:
-            return [self._at(eqn, values, arrays, None, 0)]
-        chosen, bound = open_places[0], max(values[0].shape)
-        row = self._row(eqn, values, arrays, chosen)
+        if not computed:
+            return [self._results_for_index(eqn, values, arrays, None, 0)]
+        index, bound = computed[0], max(values[0].shape)
+        row = self._read_table_row(eqn, values, arrays, index)
         if row is not None:
             return [row]
-        least = 0 if chosen.kind.startswith("u") else -1
-        index = self._at(eqn, values, arrays, chosen, bound)  # index beyond the end, where all results are equal
-        for k in range(bound - 1, least - 1, -1):
-            case = self._at(eqn, values, arrays, chosen, k)
-            beyond = self.pool.make("le", chosen, self.pool.constant(k, chosen.kind), kind=BOOL)
-            index = self._each(
-                lambda yes, no, beyond=beyond: self.pool.make("select", beyond, yes, no, kind=yes.kind),
-                [case, index],
+        lowest = 0 if index.kind.startswith("u") else -1
+        # all indices beyond the end give the same result
+        result = self._results_for_index(eqn, values, arrays, index, bound)
+        for k in range(bound - 1, lowest - 1, -1):
+            case = self._results_for_index(eqn, values, arrays, index, k)
+            is_at_most = self.pool.make("le", index, self.pool.constant(k, index.kind), kind=BOOL)
+            result = self._map_entries(
+                lambda yes, no, is_at_most=is_at_most: self.pool.make("select", is_at_most, yes, no, kind=yes.kind),
+                [case, result],
                 case.shape,
             )
-        return [index]
+        return [result]
 
-    def _row(
-        self, eqn: Any, values: Sequence[np.ndarray], arrays: Sequence[np.ndarray], chosen: Node
+    def _read_table_row(
+        self, eqn: Any, values: Sequence[np.ndarray], arrays: Sequence[np.ndarray], index: Node
     ) -> np.ndarray | None:
         """Translate a row of a parameter array at a computed index to table[index] in C; None for other operations.
 
@@ -248,56 +251,61 @@ class Translator:
         table, count = values[0], len(values[0])
         if eqn.primitive.name != "dynamic_slice" or count < 2 or table.flat[0].op != "place":
             return None
-        cases = [self._at(eqn, values, arrays, chosen, k) for k in (0, 1, count - 1)]
+        cases = [self._results_for_index(eqn, values, arrays, index, k) for k in (0, 1, count - 1)]
         for first, *others in zip(*(case.flat for case in cases), strict=True):
             expected = (first.value.replace("[0]", f"[{k}]", 1) for k in (1, count - 1)) if first.op == "place" else ()
             if [node.value for node in others] != [*expected]:
                 return None
-        low, high = (self.pool.constant(k, chosen.kind) for k in (0, count - 1))
-        index = self.pool.make("min", self.pool.make("max", chosen, low, kind=chosen.kind), high, kind=chosen.kind)
-        return self._each(lambda node: self.pool.make("row", node, index, kind=node.kind), cases[:1], cases[0].shape)
+        low, high = (self.pool.constant(k, index.kind) for k in (0, count - 1))
+        clipped = self.pool.make("min", self.pool.make("max", index, low, kind=index.kind), high, kind=index.kind)
+        return self._map_entries(
+            lambda node: self.pool.make("row", node, clipped, kind=node.kind), cases[:1], cases[0].shape
+        )
 
-    def _at(
-        self, eqn: Any, values: Sequence[np.ndarray], arrays: Sequence[np.ndarray], chosen: Node | None, k: int
+    def _results_for_index(
+        self, eqn: Any, values: Sequence[np.ndarray], arrays: Sequence[np.ndarray], index: Node | None, k: int
     ) -> np.ndarray:
-        """Return the results of a primitive with indices for the case that the computed index `chosen` is k."""
-        if eqn.primitive.name in _ADDS:
-            array, at, more = values
-            return self._added(eqn, array, at, more, chosen, k)
-        pool: list[Node] = []
-        numbered: dict[int, np.ndarray] = {}
+        """Return the results of a primitive with indices for the case that the computed index `index` is k."""
+        if eqn.primitive.name in _INDEXED_ADDITIONS:
+            array, indices, addends = values
+            return self._add_at_indices(eqn, array, indices, addends, index, k)
+        entries: list[Node] = []
+        positions: dict[int, np.ndarray] = {}
         for array in arrays:
-            numbered[id(array)] = np.arange(len(pool), len(pool) + array.size, dtype=np.int32).reshape(array.shape)
-            pool += list(array.flat)
-        pool.append(_filling(self.pool, eqn))
+            numbers = np.arange(len(entries), len(entries) + array.size, dtype=np.int32)
+            positions[id(array)] = numbers.reshape(array.shape)
+            entries += list(array.flat)
+        entries.append(_fill_node(self.pool, eqn))
         operands = []
         for variable, value in zip(eqn.invars, values, strict=True):
-            if id(value) in numbered:
-                operands.append(jnp.asarray(numbered[id(value)]))
+            if id(value) in positions:
+                operands.append(jnp.asarray(positions[id(value)]))
             else:
-                operands.append(jnp.asarray(_numbers(value, chosen, k), dtype=variable.aval.dtype))
+                operands.append(jnp.asarray(_constant_values(value, index, k), dtype=variable.aval.dtype))
         with jax.ensure_compile_time_eval():
-            out = np.asarray(components.bind(_numbering(eqn), operands)[0])
-        inside = (out >= 0) & (out < len(pool) - 1)
-        return object_array(out.shape, (pool[i if ok else -1] for i, ok in zip(out.flat, inside.flat, strict=True)))
+            out = np.asarray(components.bind(_with_marked_fill(eqn), operands)[0])
+        is_inside = (out >= 0) & (out < len(entries) - 1)
+        chosen = (entries[i if ok else -1] for i, ok in zip(out.flat, is_inside.flat, strict=True))
+        return object_array(out.shape, chosen)
 
-    def _added(
-        self, eqn: Any, array: np.ndarray, places: np.ndarray, more: np.ndarray, chosen: Node | None, k: int
+    def _add_at_indices(
+        self, eqn: Any, array: np.ndarray, indices: np.ndarray, addends: np.ndarray, index: Node | None, k: int
     ) -> np.ndarray:
-        """Return an array with additions or subtractions at indices, if the computed index `chosen` is k."""
-        known, types = _numbers(places, chosen, k), [variable.aval.dtype for variable in eqn.invars]
+        """Return an array with additions or subtractions at indices, if the computed index `index` is k."""
+        numbers, types = _constant_values(indices, index, k), [variable.aval.dtype for variable in eqn.invars]
         total = array.copy()
-        for index in np.ndindex(*more.shape):  # find the entries that each number is added to
-            one = np.zeros(more.shape)
-            one[index] = 1.0
+        for position in np.ndindex(*addends.shape):  # find the entries that each number is added to
+            unit_addend = np.zeros(addends.shape)
+            unit_addend[position] = 1.0
             with jax.ensure_compile_time_eval():
                 arrays = [
-                    jnp.asarray(v, dtype) for v, dtype in zip((np.zeros(array.shape), known, one), types, strict=True)
+                    jnp.asarray(v, dtype)
+                    for v, dtype in zip((np.zeros(array.shape), numbers, unit_addend), types, strict=True)
                 ]
-                hit = np.asarray(components.bind(eqn, arrays)[0])
-            for at in map(tuple, np.argwhere(hit)):
-                both: Any = total[at], more[index]
-                total[at] = self.pool.make(_ADDS[eqn.primitive.name], *both, kind=kind_of(types[0]))
+                is_changed = np.asarray(components.bind(eqn, arrays)[0])
+            for entry in map(tuple, np.argwhere(is_changed)):
+                operands: Any = total[entry], addends[position]
+                total[entry] = self.pool.make(_INDEXED_ADDITIONS[eqn.primitive.name], *operands, kind=kind_of(types[0]))
         return total
 
 
@@ -308,12 +316,12 @@ def _is_threefry(eqn: Any) -> bool:
     return getattr(info, "func_filename", None) == draws.__file__ and eqn.params.get("name") == "threefry"
 
 
-def _numbering(eqn: Any) -> Any:
+def _with_marked_fill(eqn: Any) -> Any:
     """Return the same gather for an array of indices instead of values; entries outside of the array become -1."""
     return eqn.replace(params={**eqn.params, "fill_value": -1}) if "fill_value" in eqn.params else eqn
 
 
-def _filling(pool: Pool, eqn: Any) -> Node:
+def _fill_node(pool: Pool, eqn: Any) -> Node:
     """Return the fill value of a gather outside of the array; by default NaN, or an extreme of the integer type."""
     dtype, value = eqn.outvars[0].aval.dtype, eqn.params.get("fill_value")
     if value is None and jnp.issubdtype(dtype, jnp.integer):
@@ -324,10 +332,10 @@ def _filling(pool: Pool, eqn: Any) -> Node:
     return pool.constant(value, kind_of(dtype))
 
 
-def _wraps(eqn: Any) -> bool:
+def _wraps_around(eqn: Any) -> bool:
     """Return whether the equation computes integers of 8 or 16 bits, which wrap around unlike C's of 32 bits."""
-    narrow = any(jnp.issubdtype(v.aval.dtype, jnp.integer) and v.aval.dtype.itemsize < 4 for v in eqn.outvars)
-    return narrow and eqn.primitive.name not in _KEPT and any(v.aval.dtype != bool for v in eqn.invars)
+    is_narrow = any(jnp.issubdtype(v.aval.dtype, jnp.integer) and v.aval.dtype.itemsize < 4 for v in eqn.outvars)
+    return is_narrow and eqn.primitive.name not in _PASS_THROUGH and any(v.aval.dtype != bool for v in eqn.invars)
 
 
 def _has_kind(dtype: Any) -> bool:
@@ -338,22 +346,22 @@ def _has_kind(dtype: Any) -> bool:
         return False
 
 
-def _numbers(value: np.ndarray, chosen: Node | None = None, k: int = 0) -> np.ndarray:
-    """Return the numbers of an array of constant nodes. The node `chosen` counts as the constant k."""
-    return np.asarray([k if node is chosen else node.value for node in value.flat]).reshape(value.shape)
+def _constant_values(value: np.ndarray, index: Node | None = None, k: int = 0) -> np.ndarray:
+    """Return the numbers of an array of constant nodes. The node `index` counts as the constant k."""
+    return np.asarray([k if node is index else node.value for node in value.flat]).reshape(value.shape)
 
 
-_FOLDS = {"reduce_sum": "add", "reduce_max": "max", "reduce_min": "min", "reduce_prod": "mul", "reduce_and": "and",
+_REDUCTIONS = {"reduce_sum": "add", "reduce_max": "max", "reduce_min": "min", "reduce_prod": "mul", "reduce_and": "and",
           "reduce_or": "or"}  # fmt: skip
-_LOGICAL = ("reduce_and", "reduce_or")  # reductions with a rule for bool only, not for the bits of integers
-_SCANS = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}
+_BOOL_REDUCTIONS = ("reduce_and", "reduce_or")  # reductions with a rule for bool only, not for the bits of integers
+_CUMULATIVE = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}
 _MOVES = set(
     "broadcast_in_dim concatenate expand_dims pad reshape rev slice split squeeze stack tile transpose unstack "
     "dynamic_slice dynamic_update_slice gather scatter".split()
 )
-_ADDS = {"scatter-add": "add", "scatter-sub": "sub"}
+_INDEXED_ADDITIONS = {"scatter-add": "add", "scatter-sub": "sub"}
 # primitives that return some of their inputs, so that narrow integers cannot overflow
-_KEPT = {
+_PASS_THROUGH = {
     *_MOVES,
     *"clamp copy copy_p max min optimization_barrier reduce_max reduce_min select_n stop_gradient".split(),
 }

@@ -14,7 +14,7 @@ from scipy.linalg import expm
 from ptsmc_jax.campaigns import runs
 from ptsmc_jax.campaigns.runs import Run
 from ptsmc_jax.laws.kinematics import AdditiveKinematics
-from ptsmc_jax.laws.prescribed_time import PrescribedTime, expansion
+from ptsmc_jax.laws.prescribed_time import PrescribedTime, surface_coefficients
 from ptsmc_jax.numerics import attitude
 from ptsmc_jax.numerics.pytrees import pytree
 from ptsmc_jax.observers import nonlinear
@@ -65,7 +65,7 @@ def _expansion() -> Slip:
         for n in (2, 3, 4, 5):
             derivative, x_derivative = jax.grad(derivative), jax.grad(x_derivative)
             states.append(x_derivative(t))
-            c = expansion(jnp.asarray(eta), n)
+            c = surface_coefficients(jnp.asarray(eta), n)
             s = sum(c[i] * tau**i * states[i] for i in range(n))
             found.append(derivative(t) * tau ** (eta + n - 1) / s - 1.0)
         return jnp.abs(jnp.stack(found))

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PyTree
 
 from ptsmc_jax.numerics.pytrees import Scalar
 
-State = PyTree  # of a plant, or its derivative
+State = PyTree  # state of a plant, or the time derivative of a state
 
 
 class Chart(NamedTuple):
@@ -20,9 +20,9 @@ class Chart(NamedTuple):
 
     name: str
     title: str
-    label: str  # of the axis, with the unit
-    column: str  # of `Plant.columns`
-    with_reference: bool = False  # the target has a field of this name
+    label: str  # label of the axis, with the unit
+    column: str  # name in `Plant.columns`
+    with_reference: bool = False  # whether the target has a field of this name, which is plotted, too
 
 
 class Plant(ABC):
@@ -36,10 +36,10 @@ class Plant(ABC):
 
     inertia: Any  # (m, m)
     inertia_inverse: Any  # (m, m)
-    custom_functions: ClassVar[bool] = False  # its rates are unknown before a run
+    custom_functions: ClassVar[bool] = False  # whether users define its equations, so that its time scales are unknown
     input_name: ClassVar[str] = "control"
-    input_unit: ClassVar[str] = ""  # of inputs and disturbances; empty: the plant has units of its own
-    # what sensors measure of a state: names and meanings
+    input_unit: ClassVar[str] = ""  # unit of inputs and disturbances; empty: custom units
+    # names and meanings of the parts of a state that sensors measure
     signals: ClassVar[dict[str, str]] = {"x": "the measured state, in its own units"}
     largest_measurement: ClassVar[float] = 1e12  # exported flight software refuses larger numbers
     # rounding error of an error near zero, which is a difference of measured numbers, in units of the resolution
@@ -85,14 +85,14 @@ class Plant(ABC):
     def input_for(self, t: Scalar, x: State, w_dot: Float[Array, " m"], d: Float[Array, " m"]) -> Float[Array, " m"]:
         """Return the input for this w' and disturbance d."""
 
-    def unexplained(self, t: Scalar, x: State, x_dot: State, u: Float[Array, " m"]) -> Float[Array, " m"]:
+    def implied_disturbance(self, t: Scalar, x: State, x_dot: State, u: Float[Array, " m"]) -> Float[Array, " m"]:
         """Return the disturbance M w' - f(t, x, u) of a motion."""
         return self.mass(t, x) @ self.velocity(x_dot) - self.generalised_force(t, x, u)
 
-    def unexplained_impulse(
+    def implied_disturbance_impulse(
         self, t: Scalar, x: State, x_next: State, u: Float[Array, " m"], dt: Scalar
     ) -> Float[Array, " m"]:
-        """Return the integral of `unexplained` over a period dt [s] that ends at t, by the trapezium rule."""
+        """Return the integral of `implied_disturbance` over a period dt [s] that ends at t, by the trapezium rule."""
         before = t - dt
         force = 0.5 * (self.generalised_force(before, x, u) + self.generalised_force(t, x_next, u))
         mass = 0.5 * (self.mass(before, x) + self.mass(t, x_next))
@@ -110,20 +110,20 @@ class Plant(ABC):
         """Return the visible state from its signals, the inverse of `signals_of`."""
         return signals["x"]
 
-    def accepted(self, measured: State) -> State:
-        """Return a measured state with its constraints met; a state that meets them to rounding is not changed."""
+    def normalise_measurement(self, measured: State) -> State:
+        """Return a measured state with its constraints met. A state that meets them up to rounding is not changed."""
         return measured
 
-    def nearest(self, x: State, other: State) -> State:
-        """Return the form of a state that is nearest to another state: q and -q are one attitude."""
+    def nearest_representation(self, x: State, other: State) -> State:
+        """Return the representation of a state that is nearest to another state: q and -q are the same attitude."""
         return x
 
     def visible(self, x: State) -> State:
         """Return the part of a state that sensors measure, which is the state of the design model."""
         return x
 
-    def to_plan_by(self, model: "Plant") -> "Plant":
-        """Return the plant for planning a motion: `model`, the law's, if the input acts through hidden states."""
+    def planning_plant(self, model: "Plant") -> "Plant":
+        """Return the plant for planning a motion: the law's `model` if the input acts through hidden states."""
         return self
 
     def with_hidden_at_rest(self, visible: State) -> State:
@@ -146,7 +146,7 @@ class Plant(ABC):
         """Return the momentum, or None; its largest 2-norm is the metric peak_momentum."""
         return None
 
-    def too_fast(self, x: State, dt: Scalar) -> Array:
+    def is_too_fast(self, x: State, dt: Scalar) -> Array:
         """Return whether the state changes too much for an integration step of dt [s]."""
         return jnp.zeros_like(dt, dtype=bool)
 
@@ -165,20 +165,24 @@ class Plant(ABC):
 
 def as_pytree(function: Callable | None) -> Any:
     """Return a function as a pytree, for a field of a plant; pytrees and None are returned unchanged."""
-    plain = function is not None and jax.tree.leaves(function) == [function]
-    return jax.tree_util.Partial(function) if plain else function
+    is_plain_function = function is not None and jax.tree.leaves(function) == [function]
+    return jax.tree_util.Partial(function) if is_plain_function else function
 
 
 def check_indices(function: Callable, *arguments: Any) -> None:
     """Raise IndexError if a custom function takes an element that its arguments do not have.
 
-    JAX would silently take the last element. arguments: pytrees of arrays, of their shapes, or of plain numbers.
+    JAX would silently take the last element.
+
+    Args:
+        function: the custom function.
+        arguments: its arguments, as pytrees of arrays, of their shapes, or of plain numbers.
     """
     try:
-        # NumPy checks indices
-        known = jax.tree.map(lambda v: np.zeros(v.shape, v.dtype) if hasattr(v, "shape") else v, arguments)
-        jax.eval_shape(lambda: function(*known))
+        # NumPy raises IndexError, and JAX does not
+        numeric_arguments = jax.tree.map(lambda v: np.zeros(v.shape, v.dtype) if hasattr(v, "shape") else v, arguments)
+        jax.eval_shape(lambda: function(*numeric_arguments))
     except IndexError:
         raise
-    except (Exception, SystemExit):  # the function works with JAX's arrays only
+    except (Exception, SystemExit):  # the function accepts JAX arrays only
         return

@@ -32,7 +32,7 @@ class FlexibleSpacecraft(Spacecraft):
     + D' (2 z W e' + W^2 e). Gennaro, Output stabilization of flexible spacecraft with active vibration suppression,
     IEEE Trans. Aerospace and Electronic Systems 39(3), 2003. A pendulum or a mass on a spring, as which liquid sloshes,
     is such a mode. Without damping a free mode rings at W / sqrt(1 - D'D / J) about a principal axis of its own.
-    `input_for` is that of the body turned as a rigid one.
+    `input_for` neglects the motion of the modes.
     """
 
     frequency: Leaf  # (n,) W, with the body held [rad/s]
@@ -41,76 +41,83 @@ class FlexibleSpacecraft(Spacecraft):
     rest_inverse: Leaf  # (3, 3) (J - D'D)^-1 [1/(kg m^2)]
 
     def force(self, modes: Modes) -> Float[Array, " n"]:
-        """Force of springs and dampers on the modes, 2 z W e' + W^2 e [sqrt(kg) m/s^2]."""
+        """Return the force of springs and dampers on the modes, 2 z W e' + W^2 e [sqrt(kg) m/s^2]."""
         return self.frequency * (2.0 * self.damping * modes.rate + self.frequency * modes.e)
 
     @property
     def rest_inertia(self) -> Float[Array, "3 3"]:
-        """J - D'D [kg m^2]."""
+        """The inertia J - D'D [kg m^2] that multiplies w' if e'' is eliminated."""
         return self.inertia - self.coupling.T @ self.coupling
 
     def mass(self, t: Scalar, x: AttitudeState) -> Float[Array, "3 3"]:
-        """J - D'D [kg m^2]."""
+        """Return J - D'D [kg m^2]."""
         return self.rest_inertia
 
     def generalised_force(self, t: Scalar, x: AttitudeState, u: Float[Array, "3"]) -> Float[Array, "3"]:
-        """(J - D'D) w' without the disturbance [N m]."""
+        """Return (J - D'D) w' without the disturbance [N m]."""
         return u - attitude.cross(x.w, self.momentum(x)) + self.coupling.T @ self.force(x.modes)
 
     def rate(self, t: Scalar, x: AttitudeState, u: Float[Array, "3"], disturbance: Float[Array, "3"]) -> AttitudeState:
-        """Time derivative of the state under torque and disturbance [N m]."""
+        """Return the time derivative of the state under torque and disturbance [N m]."""
         w_dot = self.rest_inverse @ (self.generalised_force(t, x, u) + disturbance)
         e_ddot = -self.force(x.modes) - self.coupling @ w_dot
         return AttitudeState(attitude.derivative(x.q, x.w), w_dot, Modes(x.modes.rate, e_ddot))
 
     def visible(self, x: AttitudeState) -> AttitudeState:
-        """Attitude and rate."""
+        """Return attitude and rate, without the modes."""
         return x._replace(modes=None)
 
     def with_hidden_at_rest(self, visible: AttitudeState) -> AttitudeState:
-        """With the modes at rest: e = e' = 0, the body turning as a rigid one."""
+        """Return the state with this attitude and rate, and with the modes at rest, e = e' = 0."""
         return visible._replace(modes=Modes(jnp.zeros_like(self.frequency), jnp.zeros_like(self.frequency)))
 
     def retract(self, x: AttitudeState, by: Float[Array, " n"]) -> AttitudeState:
-        """Moved as a rigid body is, then by e [sqrt(kg) m] and e' [sqrt(kg) m/s]."""
+        """Return the state near x, at six coordinates of a rigid body, then e [sqrt(kg) m] and e' [sqrt(kg) m/s]."""
         n = self.frequency.shape[-1]
         near = super().retract(x, by[:6])
         return near._replace(modes=Modes(x.modes.e + by[6 : 6 + n], x.modes.rate + by[6 + n :]))
 
     def local_coordinates(self, x: AttitudeState, other: AttitudeState) -> Float[Array, " n"]:
-        """Local coordinates of the other state: of the rigid body, then of e and e' [sqrt(kg) m, sqrt(kg) m/s]."""
+        """Return the local coordinates of another state: rigid body, then e [sqrt(kg) m] and e' [sqrt(kg) m/s]."""
         return jnp.concatenate(
             [super().local_coordinates(x, other), other.modes.e - x.modes.e, other.modes.rate - x.modes.rate]
         )
 
     def momentum(self, x: AttitudeState) -> Float[Array, "3"]:
-        """Angular momentum in body axes, J w + D' e' [N m s]."""
+        """Return the angular momentum in body axes, J w + D' e' [N m s]."""
         return self.inertia @ x.w + self.coupling.T @ x.modes.rate
 
     def energy(self, x: AttitudeState) -> Scalar:
-        """Kinetic and elastic energy, (w'J w + 2 w'D'e' + |e'|^2 + |W e|^2) / 2 [J]; with u = d = 0 it cannot grow."""
+        """Return the kinetic and elastic energy, (w'J w + 2 w'D'e' + |e'|^2 + |W e|^2) / 2 [J].
+
+        It cannot grow if u = d = 0.
+        """
         e, rate = x.modes
         kinetic = x.w @ self.inertia @ x.w + 2.0 * x.w @ (self.coupling.T @ rate) + rate @ rate
         return (kinetic + jnp.sum((self.frequency * e) ** 2)) / 2.0
 
     def modal_amplitude(self, x: AttitudeState) -> Scalar:
-        """Size of the modes' motion, the square root of the sum of e^2 + (e'/W)^2 [sqrt(kg) m]."""
+        """Return the amplitude of the modes, the square root of the sum of e^2 + (e'/W)^2 [sqrt(kg) m]."""
         e, rate = x.modes
         return guards.norm(jnp.concatenate([e, rate / self.frequency]))
 
     def with_inertia(self, inertia: Float[Array, "3 3"], inverse: Float[Array, "3 3"]) -> "FlexibleSpacecraft":
-        """The body with another J [kg m^2], (3, 3); a run whose J leaves no J - D'D > 0 is marked."""
+        """Return the body with another J [kg m^2], (3, 3). Its runs diverge if J - D'D is not positive definite."""
         return replace(self, inertia=inertia, inertia_inverse=inverse).with_rest_inverse()
 
     def with_rest_inverse(self) -> "FlexibleSpacecraft":
-        """The body with (J - D'D)^-1 made of its J and D; not finite where J - D'D is not positive definite."""
-        rest = self.rest_inertia
-        minors = (rest[0, 0], rest[0, 0] * rest[1, 1] - rest[0, 1] * rest[1, 0], matrices.determinant(rest))
-        definite = jnp.all(jnp.stack(minors) > 0.0)
-        return replace(self, rest_inverse=jnp.where(definite, matrices.solve(rest, jnp.eye(3)), jnp.nan))
+        """Return the body with (J - D'D)^-1 computed from J and D, or NaN if J - D'D is not positive definite."""
+        inertia = self.rest_inertia
+        leading_minors = (
+            inertia[0, 0],
+            inertia[0, 0] * inertia[1, 1] - inertia[0, 1] * inertia[1, 0],
+            matrices.determinant(inertia),
+        )
+        is_positive_definite = jnp.all(jnp.stack(leading_minors) > 0.0)
+        return replace(self, rest_inverse=jnp.where(is_positive_definite, matrices.solve(inertia, jnp.eye(3)), jnp.nan))
 
     def hidden_columns(self, x: AttitudeState) -> dict[str, ArrayLike]:
-        """Modal coordinates e1.. [sqrt(kg) m] and their rates e_dot1.. [sqrt(kg) m/s]."""
+        """Return modal coordinates e1.. [sqrt(kg) m] and their rates e_dot1.. [sqrt(kg) m/s]."""
         return {"e": x.modes.e, "e_dot": x.modes.rate}
 
 
@@ -118,10 +125,10 @@ def flexible(inertia: object, frequency: object, damping: object, coupling: obje
     """Return a flexible spacecraft from its inertia and its modes.
 
     Args:
-        inertia: of the whole body with its modes at rest, as `rigid_body.spacecraft` takes it [kg m^2].
-        frequency: (n,) of each mode with the body held [rad/s].
-        damping: (n,) [-].
-        coupling: (n, 3) [sqrt(kg) m].
+        inertia: inertia of the whole body with its modes at rest, in the form of `rigid_body.spacecraft` [kg m^2].
+        frequency: frequency of each mode with the body held, (n,) [rad/s].
+        damping: damping ratio of each mode, (n,) [-].
+        coupling: coupling of each mode to the rotation, (n, 3) [sqrt(kg) m].
 
     Returns:
         The spacecraft.

@@ -38,86 +38,86 @@ class System(Plant):
         return {"": (2 * self.inputs,)}
 
     def split(self, x: Float[Array, " twice"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-        """x_1 and x_2."""
+        """Return x_1 and x_2, (n,) each."""
         n = self.inputs
         return x[:n], x[n : 2 * n]
 
     def position(self, x: Float[Array, " twice"]) -> Float[Array, " n"]:
-        """x_1."""
+        """Return x_1."""
         return x[: self.inputs]
 
     def velocity(self, x: Float[Array, " twice"]) -> Float[Array, " n"]:
-        """x_2."""
+        """Return x_2."""
         return x[self.inputs : 2 * self.inputs]
 
     def position_rate(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, " n"]:
-        """x_1' = F."""
+        """Return x_1' = F."""
         return self.F(t, *self.split(x))
 
-    def slope(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, "n n"]:
-        """dF/dx2."""
+    def rate_jacobian(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, "n n"]:
+        """Return the Jacobian dF/dx2 of x_1'."""
         return jax.jacfwd(self.F, argnums=2)(t, *self.split(x))
 
     def coasting_acceleration(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, " n"]:
-        """The x_1'' for x_2' = 0: dF/dt + dF/dx1 F."""
+        """Return x_1'' for x_2' = 0, which is dF/dt + dF/dx1 F."""
         x_1, x_2 = self.split(x)
         rates = (jnp.ones_like(t), self.F(t, x_1, x_2))
         return jax.jvp(lambda t, x_1: self.F(t, x_1, x_2), (t, x_1), rates)[1]
 
     def drift(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, " n"]:
-        """H."""
+        """Return H."""
         return self.H(t, *self.split(x))
 
     def input_gain(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, "n n"]:
-        """G."""
+        """Return G."""
         return self.G(t, *self.split(x))
 
     def disturbance_gain(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, "n n"]:
-        """D."""
+        """Return D."""
         return jnp.eye(self.inputs) if self.D is None else self.D(t, *self.split(x))
 
     def mass(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, "n n"]:
-        """D^-1."""
+        """Return D^-1."""
         one = jnp.eye(self.inputs)
         return one if self.D is None else matrices.solve(self.disturbance_gain(t, x), one)
 
-    def driven(self, t: Scalar, x: Float[Array, " twice"], u: Float[Array, " n"]) -> Float[Array, " n"]:
-        """H + G u, the x_2' without a disturbance."""
+    def undisturbed_rate(self, t: Scalar, x: Float[Array, " twice"], u: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Return H + G u, which is x_2' without the disturbance."""
         return self.drift(t, x) + self.input_gain(t, x) @ u
 
     def generalised_force(self, t: Scalar, x: Float[Array, " twice"], u: Float[Array, " n"]) -> Float[Array, " n"]:
-        """D^-1 (H + G u)."""
-        driven = self.driven(t, x, u)
-        return driven if self.D is None else matrices.solve(self.disturbance_gain(t, x), driven)
+        """Return D^-1 (H + G u)."""
+        rate = self.undisturbed_rate(t, x, u)
+        return rate if self.D is None else matrices.solve(self.disturbance_gain(t, x), rate)
 
     def rate(
         self, t: Scalar, x: Float[Array, " twice"], u: Float[Array, " n"], disturbance: Float[Array, " n"]
     ) -> Float[Array, " twice"]:
-        """Time derivative of the state, (25)."""
-        x_2_dot = self.driven(t, x, u) + self.disturbance_gain(t, x) @ disturbance
+        """Return the time derivative of the state, (25)."""
+        x_2_dot = self.undisturbed_rate(t, x, u) + self.disturbance_gain(t, x) @ disturbance
         return jnp.concatenate([self.position_rate(t, x), x_2_dot, *self.hidden_rates(t, x, u)])
 
     def hidden_rates(self, t: Scalar, x: Float[Array, " twice"], u: Float[Array, " n"]) -> tuple[Array, ...]:
-        """Derivatives of the states that follow x_2: there are none."""
+        """Return the derivatives of the hidden states, which this plant does not have."""
         return ()
 
     def input_for(
         self, t: Scalar, x: Float[Array, " twice"], w_dot: Float[Array, " n"], d: Float[Array, " n"]
     ) -> Float[Array, " n"]:
-        """G^-1 (x_2' - H - D d)."""
+        """Return the input G^-1 (x_2' - H - D d)."""
         from_input = w_dot - self.drift(t, x) - self.disturbance_gain(t, x) @ d
         return matrices.solve(self.input_gain(t, x), from_input)
 
     def speed(self, x: Float[Array, " twice"]) -> Scalar:
-        """|x_2|."""
+        """Return |x_2|."""
         return guards.norm(self.velocity(x))
 
     def jacobian(self, t: Scalar, x: Float[Array, " twice"], u: Float[Array, " n"]) -> Float[Array, "twice twice"]:
-        """The matrix dx'/dx at a constant input; integration steps must resolve its eigenvalues [1/s]."""
+        """Return dx'/dx at a constant input. Integration steps must resolve its eigenvalues [1/s]."""
         return jax.jacfwd(lambda x: self.rate(t, x, u, jnp.zeros(self.inputs)))(x)
 
     def columns(self, x: Array | np.ndarray) -> dict[str, ArrayLike]:
-        """The states x_1 and x_2, one after the other."""
+        """Return the states x_1 and x_2, one after the other."""
         return {"x": x[..., : 2 * self.inputs]}
 
 
@@ -139,27 +139,27 @@ class HiddenSystem(System):
         return {"": (2 * self.inputs + self.z0.shape[-1],)}
 
     def drift(self, t: Scalar, x: Float[Array, " whole"]) -> Float[Array, " n"]:
-        """H."""
+        """Return H."""
         return self.H(t, *self.split(x), x[2 * self.inputs :])
 
     def hidden_rates(self, t: Scalar, x: Float[Array, " whole"], u: Float[Array, " n"]) -> tuple[Array, ...]:
-        """The derivative Z of z."""
+        """Return the derivative Z of z."""
         return (self.Z(t, *self.split(x), x[2 * self.inputs :], u),)
 
     def visible(self, x: Float[Array, " whole"]) -> Float[Array, " twice"]:
-        """x_1 and x_2."""
+        """Return x_1 and x_2."""
         return x[: 2 * self.inputs]
 
-    def to_plan_by(self, model: Plant) -> Plant:
-        """The model: an input that acts only through z does not change x_2' at once."""
+    def planning_plant(self, model: Plant) -> Plant:
+        """Return the model, because an input that acts through z only does not change x_2' immediately."""
         return model
 
     def with_hidden_at_rest(self, visible: Float[Array, " twice"]) -> Float[Array, " whole"]:
-        """The state of these x_1 and x_2, with z at z0."""
+        """Return the state of these x_1 and x_2, with z = z0."""
         return jnp.append(visible, self.z0)
 
     def hidden_columns(self, x: Array | np.ndarray) -> dict[str, ArrayLike]:
-        """The states z."""
+        """Return the states z."""
         return {"z": x[..., 2 * self.inputs :]}
 
 
@@ -174,7 +174,7 @@ def system(
     Z: Callable | None = None,
     z0: object = (),
 ) -> System:
-    """Second-order system (25) from JAX functions of (t, x_1, x_2), t [s] and x_1, x_2 (n,); see `System`.
+    """Return a second-order system (25) from JAX functions of (t, x_1, x_2), t [s] and x_1, x_2 (n,); see `System`.
 
     Args:
         n: number of inputs.
@@ -188,13 +188,13 @@ def system(
         z0: z at t = 0, (k,).
 
     Raises:
-        ValueError: a function does not take such arguments, or returns another shape; or the numbers do not fit.
+        ValueError: a function fails for such arguments or returns another shape, or n, inertia or z0 is not valid.
     """
     if not isinstance(n, int) or isinstance(n, bool) or n < 1:
         raise ValueError(f"n is {n!r}, but must be a whole number of at least 1")
     number = jax.ShapeDtypeStruct((), jnp.result_type(float))
     vector = jax.ShapeDtypeStruct((n,), number.dtype)
-    z = _hidden(z0, Z)
+    z = _check_hidden_states(z0, Z)
     signatures: list[tuple[str, Any, tuple, tuple]] = [
         ("F(t, x_1, x_2)", F, (vector, vector), (n,)),
         ("H(t, x_1, x_2)", H, (vector, vector), (n,))
@@ -206,7 +206,7 @@ def system(
     ]
     for name, function, arguments, shape in signatures:
         if function is not None:
-            _check(name, function, (number, *arguments), shape)
+            _check_function(name, function, (number, *arguments), shape)
     scale = np.eye(n) if inertia is None else np.asarray(inertia, dtype=float)
     symmetric = scale.shape == (n, n) and np.abs(scale - scale.T).max() <= 1e-9 * np.abs(scale).max()
     if not symmetric or np.linalg.eigvalsh(scale)[0] <= 0:
@@ -216,36 +216,36 @@ def system(
     return System(*fields) if Z is None else HiddenSystem(*fields, as_pytree(Z), z)
 
 
-# errors of JAX for the value of a traced number, and the advice
-TRACED = (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError)
-INSTEAD = "use jax.numpy.where instead of if, and jax.numpy instead of numpy and float()"
+# errors that JAX raises if a function needs the value of a traced number, and the advice that is printed
+TRACING_ERRORS = (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError)
+TRACING_ADVICE = "use jax.numpy.where instead of if, and jax.numpy instead of numpy and float()"
 
 
-def _check(name: str, function: Callable, arguments: tuple, shape: tuple[int, ...]) -> None:
+def _check_function(name: str, function: Callable, arguments: tuple, shape: tuple[int, ...]) -> None:
     """Raise ValueError if a function fails, has no derivative, or returns another shape or type."""
-    n, exact = arguments[1].shape[0], arguments[0].dtype
+    n, dtype = arguments[1].shape[0], arguments[0].dtype
 
-    def traced(what: str, of: Callable) -> Any:
+    def trace(failure_text: str, traced_function: Callable) -> Any:
         try:
-            check_indices(of, *arguments)
-            return jax.eval_shape(of, *arguments)
+            check_indices(traced_function, *arguments)
+            return jax.eval_shape(traced_function, *arguments)
         except (Exception, SystemExit) as error:
             first_line = (str(error).splitlines() or [""])[0]
-            reason = f"{first_line.rstrip('.')}; {INSTEAD}" if isinstance(error, TRACED) else first_line
+            reason = f"{first_line.rstrip('.')}; {TRACING_ADVICE}" if isinstance(error, TRACING_ERRORS) else first_line
             failure = f"{type(error).__name__}: {reason}"
-            raise ValueError(f"{name} {what} for x_1 and x_2 of shape ({n},): {failure}") from error
+            raise ValueError(f"{name} {failure_text} for x_1 and x_2 of shape ({n},): {failure}") from error
 
-    returned = traced("fails", function)
+    returned = trace("fails", function)
     returned_shape = getattr(returned, "shape", type(returned).__name__)
     if returned_shape != shape:
         raise ValueError(f"{name} returns {returned_shape}, but for n = {n} must return an array {shape}")
-    # F alone is differentiated before anything is added to it
-    if (returned.dtype if name[0] == "F" else jnp.result_type(returned.dtype, exact)) != exact:
-        raise ValueError(f"{name} returns {returned.dtype} numbers, but must return {exact} ones")
-    traced("cannot be differentiated", lambda *at: jax.jvp(function, at, at))
+    # F is differentiated directly, so its type must be exact; other values are first added to floating-point numbers
+    if (returned.dtype if name[0] == "F" else jnp.result_type(returned.dtype, dtype)) != dtype:
+        raise ValueError(f"{name} returns {returned.dtype} numbers, but must return {dtype} ones")
+    trace("cannot be differentiated", lambda *arguments: jax.jvp(function, arguments, arguments))
 
 
-def _hidden(z0: object, Z: Callable | None) -> Float[Array, " k"]:
+def _check_hidden_states(z0: object, Z: Callable | None) -> Float[Array, " k"]:
     """Return the initial hidden states (k,). Raises ValueError if they are not a list of numbers, or Z is missing."""
     try:
         z = np.atleast_1d(np.asarray(z0, dtype=float))
@@ -254,5 +254,5 @@ def _hidden(z0: object, Z: Callable | None) -> Float[Array, " k"]:
     if z.ndim != 1 or not np.all(np.isfinite(z)):
         raise ValueError(f"z0 is {z0}, but must be a list of finite numbers")
     if (Z is None) != (z.size == 0):
-        raise ValueError("Z and z0 go together: a hidden state needs its derivative and where it begins")
+        raise ValueError("Z and z0 go together: a hidden state needs a derivative and an initial value")
     return jnp.asarray(z)

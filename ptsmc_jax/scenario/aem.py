@@ -1,7 +1,8 @@
 """CCSDS attitude ephemeris messages (AEM, CCSDS 504.0-B-1 and 504.0-B-2) as text in keyword-value notation.
 
-Start with `segment` and `write`. Frame A to frame B of the standard is a change of components, x_B = M x_A. If A is
-inertial and B the body, its quaternion (Q1, Q2, Q3, QC) is that of this package, from body to inertial axes.
+Start with `read_segment` and `format_message`. The standard's rotation from frame A to frame B is a change of
+components, x_B = M x_A. If A is inertial and B the body, its quaternion (Q1, Q2, Q3, QC) is the quaternion of this
+package, from body to inertial axes.
 """
 
 import datetime as dt
@@ -17,16 +18,16 @@ from ptsmc_jax.scenario.epochs import Epoch
 from ptsmc_jax.signals import attitude_tables
 
 VERSIONS = ("1.0", "2.0")
-INERTIAL = ("EME2000", "J2000", "GCRF", "ICRF", "MOD", "TOD", "TEME", "MEME", "EMEJ2000")
-BODY = re.compile(r"SC_BODY(_\w+)?|SC(_\w+)?|BODY(_\w+)?|.*_BODY(_\w+)?")
-UNIVERSAL = ("UTC", "UT1")
-WIDTHS = {"QUATERNION": 4, "QUATERNION/DERIVATIVE": 8, "QUATERNION/RATE": 7, "QUATERNION/ANGVEL": 7}
-SPLINES = re.compile(r"CUBIC_?SPLINE|SPLINE")
+INERTIAL_FRAMES = ("EME2000", "J2000", "GCRF", "ICRF", "MOD", "TOD", "TEME", "MEME", "EMEJ2000")
+BODY_FRAMES = re.compile(r"SC_BODY(_\w+)?|SC(_\w+)?|BODY(_\w+)?|.*_BODY(_\w+)?")
+UNIVERSAL_TIMES = ("UTC", "UT1")
+NUMBERS_PER_LINE = {"QUATERNION": 4, "QUATERNION/DERIVATIVE": 8, "QUATERNION/RATE": 7, "QUATERNION/ANGVEL": 7}
+CUBIC_SPLINE_NAMES = re.compile(r"CUBIC_?SPLINE|SPLINE")
 
 
 @dataclass
 class Block:
-    """A segment of a message: its keywords and its data, with the numbers of their lines."""
+    """A segment of a message: its keywords and its data lines, each with its line number."""
 
     keywords: dict[str, tuple[str, int]] = field(default_factory=dict)
     data: list[tuple[str, int]] = field(default_factory=list)
@@ -42,7 +43,7 @@ class Block:
         """The attitude type, such as QUATERNION/RATE."""
         return self.get("ATTITUDE_TYPE").replace(" ", "/")
 
-    def refused(self, name: str, reason: str) -> ValueError:
+    def error_at(self, name: str, reason: str) -> ValueError:
         """Return the error for the value of a keyword."""
         value, line = self.keywords[name]
         return ValueError(f"line {line}: {name} is {value}, {reason}")
@@ -54,80 +55,82 @@ class Segment(NamedTuple):
     times: np.ndarray  # (n,) [s], 0 at the start of the run
     quaternions: np.ndarray  # (n, 4) from body to inertial axes, scalar last
     rates: np.ndarray | None  # (n, 3) body rates, body axes [rad/s]
-    until: float  # end of the usable time [s]
+    usable_until: float  # end of the usable time [s]
 
 
-def segment(text: str, zero: Epoch | None = None, *, any_interpolation: bool = False) -> Segment:
+def read_segment(text: str, start_epoch: Epoch | None = None, *, any_interpolation: bool = False) -> Segment:
     """Return the segment of a message that contains t = 0.
 
     Args:
         text: the message.
-        zero: calendar time of t = 0; None: the first usable time of the first segment.
+        start_epoch: calendar time of t = 0; None: the first usable time of the first segment.
         any_interpolation: ignore an interpolation method of the message other than a cubic spline.
 
     Raises:
         ValueError: the message is damaged, or it has content that cannot be a reference. The message of the error names
             line and keyword.
     """
-    blocks = list(_blocks(text))
-    if zero is None:
-        chosen = blocks[0]
+    blocks = list(_split_segments(text))
+    if start_epoch is None:
+        block = blocks[0]
     else:
-        spans = [_span(block) for block in blocks]
-        holding = [k for k, (begin, end) in enumerate(spans) if begin.since(zero) <= 0.0 <= end.since(zero)]
-        if not holding:
-            listed = ", ".join(f"{str(begin)[:19]} to {str(end)[:19]}" for begin, end in spans)
-            raise ValueError(f"no segment contains loop.epoch; the segments are {listed}")
-        chosen = blocks[holding[-1]]  # of two segments with a common boundary, the later one
-    _check_frames(chosen)
-    _check_interpolation(chosen, any_interpolation)
-    system = chosen.get("TIME_SYSTEM")
-    if zero is not None and system not in UNIVERSAL:
-        raise chosen.refused("TIME_SYSTEM", "but loop.epoch is UTC; allowed is UTC, or no loop.epoch")
-    begin, end = _span(chosen)
-    zero = zero or begin
-    times, numbers = _data(chosen)
-    quaternions, rates = _attitudes(chosen, numbers)
-    return Segment(np.array([one.since(zero) for one in times]), quaternions, rates, end.since(zero))
+        intervals = [_usable_interval(block) for block in blocks]
+        containing = [
+            k for k, (begin, end) in enumerate(intervals) if begin.since(start_epoch) <= 0.0 <= end.since(start_epoch)
+        ]
+        if not containing:
+            shown = ", ".join(f"{str(begin)[:19]} to {str(end)[:19]}" for begin, end in intervals)
+            raise ValueError(f"no segment contains loop.epoch; the segments are {shown}")
+        block = blocks[containing[-1]]  # the later one of two segments with a common boundary
+    _check_frames(block)
+    _check_interpolation(block, any_interpolation)
+    system = block.get("TIME_SYSTEM")
+    if start_epoch is not None and system not in UNIVERSAL_TIMES:
+        raise block.error_at("TIME_SYSTEM", "but loop.epoch is UTC; allowed is UTC, or no loop.epoch")
+    begin, end = _usable_interval(block)
+    start_epoch = start_epoch or begin
+    times, numbers = _parse_data(block)
+    quaternions, rates = _convert_attitudes(block, numbers)
+    return Segment(np.array([time.since(start_epoch) for time in times]), quaternions, rates, end.since(start_epoch))
 
 
-def _blocks(text: str) -> Iterator[Block]:
+def _split_segments(text: str) -> Iterator[Block]:
     """Yield the segments of a message."""
-    block, inside, begun = None, "", False
+    block, section, has_version = None, "", False
     for number, line in enumerate(text.splitlines(), 1):
         line = line.strip()
         if not line or line.startswith("COMMENT"):
             continue
         name, equals, value = (part.strip() for part in line.partition("="))
-        if not begun:
+        if not has_version:
             if name != "CCSDS_AEM_VERS":
                 raise ValueError(f'line {number}: it is "{line[:40]}", but the first keyword of an attitude ephemeris '
                                  "message (AEM) in keyword-value notation must be CCSDS_AEM_VERS")  # fmt: skip
             if value not in VERSIONS:
                 raise ValueError(f"line {number}: CCSDS_AEM_VERS is {value}, but must be {' or '.join(VERSIONS)}")
-            begun = True
+            has_version = True
         elif line == "META_START":
             if block is not None:
                 yield block
-            block, inside = Block(), "META"
+            block, section = Block(), "META"
         elif line == "META_STOP":
-            inside = "DATA"
+            section = "DATA"
         elif line in ("DATA_START", "DATA_STOP"):
-            if inside != "DATA":
+            if section != "DATA":
                 raise ValueError(f"line {number}: {line} is not after META_STOP")
-        elif inside == "DATA":
+        elif section == "DATA":
             assert block is not None
             block.data.append((line, number))
-        elif inside == "META" and block is not None and equals:
+        elif section == "META" and block is not None and equals:
             block.keywords[name] = value, number
         elif not equals:
             raise ValueError(f'line {number}: it is "{line[:40]}", but must be a keyword, = and its value')
-    if block is None or inside != "DATA":
+    if block is None or section != "DATA":
         raise ValueError("the message has no complete segment from META_START to META_STOP")
     yield block
 
 
-def _epoch(block: Block, name: str) -> Epoch:
+def _parse_epoch(block: Block, name: str) -> Epoch:
     block.get(name)
     value, line = block.keywords[name]
     try:
@@ -136,10 +139,10 @@ def _epoch(block: Block, name: str) -> Epoch:
         raise ValueError(f"line {line}: {name} is {value}, {error}") from None
 
 
-def _span(block: Block) -> tuple[Epoch, Epoch]:
-    """Return the usable time of a segment."""
+def _usable_interval(block: Block) -> tuple[Epoch, Epoch]:
+    """Return the start and the end of the usable time of a segment."""
     names = [f"USEABLE_{name}" if f"USEABLE_{name}" in block.keywords else name for name in ("START_TIME", "STOP_TIME")]
-    begin, end = (_epoch(block, name) for name in names)
+    begin, end = (_parse_epoch(block, name) for name in names)
     return begin, end
 
 
@@ -147,112 +150,112 @@ def _check_frames(block: Block) -> None:
     """Raise ValueError if the frames are not an inertial frame and the body."""
     for name, other in (("REF_FRAME_A", "REF_FRAME_B"), ("REF_FRAME_B", "REF_FRAME_A")):
         frame = block.get(name)
-        if frame not in INERTIAL and not BODY.fullmatch(frame):
-            raise block.refused(name, "which is neither inertial nor the body; allowed are a frame such as SC_BODY_1 "
-                                f"and one of {', '.join(INERTIAL)}")  # fmt: skip
-        if (frame in INERTIAL) == (block.get(other) in INERTIAL):
-            raise block.refused(name, f"and {other} is {block.get(other)}; one must be inertial, the other the body")
+        if frame not in INERTIAL_FRAMES and not BODY_FRAMES.fullmatch(frame):
+            raise block.error_at(name, "which is neither inertial nor the body; allowed are a frame such as SC_BODY_1 "
+                                f"and one of {', '.join(INERTIAL_FRAMES)}")  # fmt: skip
+        if (frame in INERTIAL_FRAMES) == (block.get(other) in INERTIAL_FRAMES):
+            raise block.error_at(name, f"and {other} is {block.get(other)}; one must be inertial, the other the body")
 
 
 def _check_interpolation(block: Block, any_interpolation: bool) -> None:
     """Raise ValueError for an interpolation method without continuous rate and acceleration."""
     method = block.get("INTERPOLATION_METHOD", "CUBIC_SPLINE")
-    if not SPLINES.fullmatch(method) and not any_interpolation:
-        raise block.refused(
+    if not CUBIC_SPLINE_NAMES.fullmatch(method) and not any_interpolation:
+        raise block.error_at(
             "INTERPOLATION_METHOD", "but a reference needs continuous rate and acceleration, which a cubic spline has; "
             'allowed is CUBIC_SPLINE, or reference.interpolation = "spline" to use that spline in spite of the keyword',
         )  # fmt: skip
 
 
-def _data(block: Block) -> tuple[list[Epoch], np.ndarray]:
-    """Return the epochs and the numbers (n, width) of the data lines."""
+def _parse_data(block: Block) -> tuple[list[Epoch], np.ndarray]:
+    """Return the epochs and the numbers (n, numbers per line) of the data lines."""
     kind = block.kind
-    if kind not in WIDTHS:
-        raise block.refused("ATTITUDE_TYPE", f"but must be {' or '.join(WIDTHS)}: only quaternions are read")
+    if kind not in NUMBERS_PER_LINE:
+        raise block.error_at("ATTITUDE_TYPE", f"but must be {' or '.join(NUMBERS_PER_LINE)}: only quaternions are read")
     times, rows = [], []
     for line, number in block.data:
-        first, *cells = line.split()
+        time, *cells = line.split()
         try:
-            times.append(epochs.parse(first))
+            times.append(epochs.parse(time))
         except ValueError as error:
-            raise ValueError(f'line {number}: its time is "{first}", {error}') from None
-        if len(cells) != WIDTHS[kind]:
-            raise ValueError(f"line {number}: it has {len(cells)} numbers, but {kind} has {WIDTHS[kind]}")
-        row = [_number(cell) for cell in cells]
+            raise ValueError(f'line {number}: its time is "{time}", {error}') from None
+        if len(cells) != NUMBERS_PER_LINE[kind]:
+            raise ValueError(f"line {number}: it has {len(cells)} numbers, but {kind} has {NUMBERS_PER_LINE[kind]}")
+        row = [_to_float(cell) for cell in cells]
         if not np.all(np.isfinite(row)):
             bad = cells[int(np.argmin(np.isfinite(row)))]
             raise ValueError(f'line {number}, column {cells.index(bad) + 2}: it is "{bad}", but must be a number')
         rows.append(row)
-    return times, np.array(rows).reshape(len(rows), WIDTHS[kind])
+    return times, np.array(rows).reshape(len(rows), NUMBERS_PER_LINE[kind])
 
 
-def _number(cell: str) -> float:
+def _to_float(cell: str) -> float:
     try:
         return float(cell)
     except ValueError:
         return np.nan
 
 
-def _attitudes(block: Block, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+def _convert_attitudes(block: Block, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     """Return quaternions (n, 4) from body to inertial axes, scalar last, and body rates (n, 3) [rad/s] or None."""
     kind = block.kind
-    place = block.get("QUATERNION_TYPE", "LAST")
-    if place not in ("FIRST", "LAST"):
-        raise block.refused("QUATERNION_TYPE", "but must be FIRST or LAST")
-    way = block.get("ATTITUDE_DIR", "A2B").replace(">", "2")
-    if way not in ("A2B", "B2A"):
-        raise block.refused("ATTITUDE_DIR", "but must be A2B or B2A")
+    scalar_position = block.get("QUATERNION_TYPE", "LAST")
+    if scalar_position not in ("FIRST", "LAST"):
+        raise block.error_at("QUATERNION_TYPE", "but must be FIRST or LAST")
+    direction = block.get("ATTITUDE_DIR", "A2B").replace(">", "2")
+    if direction not in ("A2B", "B2A"):
+        raise block.error_at("ATTITUDE_DIR", "but must be A2B or B2A")
 
-    inertial_first = block.get("REF_FRAME_A") in INERTIAL
+    from_inertial = block.get("REF_FRAME_A") in INERTIAL_FRAMES
 
     def body_to_inertial(values: np.ndarray) -> np.ndarray:
-        values = np.roll(values, -1, axis=1) if place == "FIRST" else values
-        return values if inertial_first == (way == "A2B") else values * attitude_tables.CONJUGATE
+        values = np.roll(values, -1, axis=1) if scalar_position == "FIRST" else values
+        return values if from_inertial == (direction == "A2B") else values * attitude_tables.CONJUGATE
 
     quaternions, rates = body_to_inertial(numbers[:, :4]), None
     if kind == "QUATERNION/DERIVATIVE":
         rates = attitude_tables.body_rates(quaternions, body_to_inertial(numbers[:, 4:]))
     elif kind != "QUATERNION":
         rates = np.deg2rad(numbers[:, 4:])
-        rates = rates if inertial_first else -rates  # rates in a message are of frame B relative to frame A
+        rates = rates if from_inertial else -rates  # rates in a message are of frame B relative to frame A
         name = "RATE_FRAME" if kind == "QUATERNION/RATE" else "ANGVEL_FRAME"
         frame = block.get(name, "")
         frame = block.get(frame) if frame in ("REF_FRAME_A", "REF_FRAME_B") else frame
         if frame not in (block.get("REF_FRAME_A"), block.get("REF_FRAME_B")):
             raise ValueError(f'a segment has {name} = "{frame}", but must have REF_FRAME_A or REF_FRAME_B')
-        if frame in INERTIAL:
-            rates = _to_body(quaternions, rates)
+        if frame in INERTIAL_FRAMES:
+            rates = _rotate_to_body(quaternions, rates)
     return quaternions, rates
 
 
-def _to_body(q: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return vectors (n, 3) in body axes, given in inertial axes."""
-    unit = q / np.linalg.norm(q, axis=1, keepdims=True)
+def _rotate_to_body(quaternions: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Return the body components (n, 3) of vectors that are given in inertial axes."""
+    unit = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
     v, s = -unit[:, :3], unit[:, 3:]
-    turned = np.cross(v, y)
-    return y + 2.0 * (s * turned + np.cross(v, turned))
+    cross = np.cross(v, vectors)
+    return vectors + 2.0 * (s * cross + np.cross(v, cross))
 
 
-def write(name: str, times: np.ndarray, quaternions: np.ndarray, rates: np.ndarray, epoch: str | None) -> str:
+def format_message(name: str, times: np.ndarray, quaternions: np.ndarray, rates: np.ndarray, epoch: str | None) -> str:
     """Return a message (version 1.0) with attitudes and rates of a spacecraft.
 
     Args:
-        name: of the spacecraft.
+        name: name of the spacecraft.
         times: (n,) [s].
         quaternions: (n, 4) from body to inertial axes, scalar last.
         rates: (n, 3) body rates, body axes [rad/s].
         epoch: calendar time of t = 0, UTC; None: 2000-01-01T12:00:00, with a comment.
     """
-    zero = Epoch(0, 0.0) if epoch is None else epochs.of_key(epoch)  # the standard has calendar times only
-    begin, end = (zero.after(float(times[k])) for k in (0, -1))
+    start_epoch = Epoch(0, 0.0) if epoch is None else epochs.parse_key(epoch)  # the standard has calendar times only
+    begin, end = (start_epoch.after(float(times[k])) for k in (0, -1))
     created = dt.datetime.now(dt.UTC).strftime("%Y-%m-%dT%H:%M:%S")
-    unknown = ["COMMENT The scenario has no epoch: t = 0 is at 2000-01-01T12:00:00."] if epoch is None else []
-    head = [
+    epoch_comment = ["COMMENT The scenario has no epoch: t = 0 is at 2000-01-01T12:00:00."] if epoch is None else []
+    header = [
         "CCSDS_AEM_VERS = 1.0",
         f"CREATION_DATE = {created}",
         "ORIGINATOR = PTSMC-JAX",
         "META_START",
-        *unknown,
+        *epoch_comment,
         "COMMENT Quaternion from body to inertial axes, in the order Q1 Q2 Q3 QC, then body rates in deg/s.",
         f"OBJECT_NAME = {name}",
         "OBJECT_ID = 0000-000A",
@@ -271,6 +274,7 @@ def write(name: str, times: np.ndarray, quaternions: np.ndarray, rates: np.ndarr
     ]
     numbers = np.column_stack([quaternions, np.rad2deg(rates)]).tolist()
     rows = [
-        f"{zero.after(float(t))} {' '.join(map(repr, row))}" for t, row in zip(times.tolist(), numbers, strict=True)
+        f"{start_epoch.after(float(t))} {' '.join(map(repr, row))}"
+        for t, row in zip(times.tolist(), numbers, strict=True)
     ]
-    return "\n".join([*head, *rows, "DATA_STOP", ""])
+    return "\n".join([*header, *rows, "DATA_STOP", ""])

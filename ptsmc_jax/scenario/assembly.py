@@ -40,34 +40,34 @@ class Study:
 
 def catalogue(scenario: Scenario) -> dict[str, catalogues.Entry]:
     """Return the metrics of a scenario's runs, by name."""
-    timed = {r.timed for r in requirements(scenario)}
+    timed_metrics = {r.timed for r in requirements(scenario)}
 
-    def there(name: str, entry: catalogues.Entry) -> bool:
-        if name.startswith(catalogues.WITHIN) and name not in timed:
+    def is_available(name: str, entry: catalogues.Entry) -> bool:
+        if name.startswith(catalogues.WITHIN) and name not in timed_metrics:
             return False
-        if name.startswith(catalogues.KNOWLEDGE) and not scenario.measured:
+        if name.startswith(catalogues.KNOWLEDGE) and not scenario.uses_measurements:
             return False
         return entry.table is None or getattr(scenario, entry.table, None) is not None
 
-    return {name: entry for name, entry in scenario.metrics.items() if there(name, entry)}
+    return {name: entry for name, entry in scenario.metrics.items() if is_available(name, entry)}
 
 
 def requirements(scenario: Scenario) -> tuple[Requirement, ...]:
     """Return the requirements on the metrics of a scenario's runs."""
-    units = scenario.metrics
+    metrics = scenario.metrics
     return tuple(
         Requirement(
             name,
             value.limit,
-            units[name].unit,
+            metrics[name].unit,
             value.fraction,
             value.confidence,
             interpretation=value.interpretation or "ensemble",
         )
         if isinstance(value, t.Limit)
-        else Requirement(name, float(value), units[name].unit)
+        else Requirement(name, float(value), metrics[name].unit)
         for name, value in scenario.requirements.items()
-        if name in units
+        if name in metrics
     )
 
 
@@ -105,11 +105,11 @@ def study(
     """
     if not isinstance(reach, timing.Reach | None):
         raise TypeError(f"a reach is needed, as reach_of(scenario) returns it, but this is a {type(reach).__name__}")
-    configure.warn_if_forgotten()
+    configure.warn_if_not_configured()
     scenario = reading.complete(reading.to_scenario(scenario))
     setup = build.setup(scenario)
-    parts = setup.timed(*timing.timing(scenario, setup, reach or timing.reach_of(scenario), saves))
+    parts = setup.with_clock(*timing.choose_timing(scenario, setup, reach or timing.reach_of(scenario), saves))
     dispersion = build.dispersion(scenario, parts)
     custom_checks.check(parts, dispersion, scenario)
-    start_checks.check(scenario, parts, dispersion, drawn=drawn)
+    start_checks.check(scenario, parts, dispersion, dispersed=drawn)
     return Study(scenario, parts, dispersion, requirements(scenario), margin_requirements(scenario))

@@ -14,13 +14,13 @@ from ptsmc_jax.scenario import aem, epochs
 from ptsmc_jax.scenario.epochs import Epoch
 from ptsmc_jax.signals import attitude_tables
 
-TIMES = ("t", "time", "time_s", "seconds", "epoch", "utc", "time_utc", "datetime")
-LAST = (("qx", "qy", "qz", "qw"), ("q_x", "q_y", "q_z", "q_w"))  # names that label the scalar part
-FIRST = (("q0", "q1", "q2", "q3"),)
-NUMBERED = ("q1", "q2", "q3", "q4")  # the order of these is stated by a key
-RATES = (("w1", "w2", "w3"), ("wx", "wy", "wz"), ("w_x", "w_y", "w_z"))
-LARGEST_NORM_ERROR = 1e-3  # of a quaternion with four digits
-LARGEST_RATE_ERROR = 0.1  # of the rates, as a fraction of the largest one
+TIME_NAMES = ("t", "time", "time_s", "seconds", "epoch", "utc", "time_utc", "datetime")
+SCALAR_LAST = (("qx", "qy", "qz", "qw"), ("q_x", "q_y", "q_z", "q_w"))  # names that label the scalar part
+SCALAR_FIRST = (("q0", "q1", "q2", "q3"),)
+UNLABELLED = ("q1", "q2", "q3", "q4")  # names that do not label the scalar part: a key states the order
+RATE_NAMES = (("w1", "w2", "w3"), ("wx", "wy", "wz"), ("w_x", "w_y", "w_z"))
+LARGEST_NORM_ERROR = 1e-3  # allows quaternions with four digits
+LARGEST_RATE_ERROR = 0.1  # largest allowed difference of rates / largest rate
 MOST_SAMPLES = 100_000
 
 
@@ -30,7 +30,7 @@ class Samples:
 
     times: np.ndarray  # (n,) increasing [s], 0 at the start of the run
     quaternions: np.ndarray  # (n, 4) unit quaternions from body to inertial axes, scalar last
-    ends: np.ndarray | None  # (2, 3) rates of the first and the last sample in body axes [rad/s], if known
+    end_rates: np.ndarray | None  # (2, 3) rates of the first and the last sample in body axes [rad/s], if known
     usable_until: float  # end of the usable time [s]
     fastest: float  # largest rate, plus the root of the largest acceleration [rad/s]
 
@@ -50,39 +50,41 @@ def read(file: str, order: str | None, direction: str | None, interpolation: str
     """
     path = Path(file)
     try:
-        about = path.stat()
+        file_status = path.stat()
     except OSError as error:
         raise ValueError(f"which cannot be read: {error.strerror}") from None
     if path.is_dir():
         raise ValueError("which is a folder, but must be a CSV, Parquet or AEM file")
-    return _read(path, order, direction, interpolation, epoch, (about.st_size, about.st_mtime_ns))
+    return _read_version(path, order, direction, interpolation, epoch, (file_status.st_size, file_status.st_mtime_ns))
 
 
 @functools.lru_cache(maxsize=8)
-def _read(
+def _read_version(
     path: Path, order: str | None, direction: str | None, interpolation: str, epoch: str | None, version: tuple
 ) -> Samples:
-    zero = None if epoch is None else epochs.of_key(epoch)
+    start_epoch = None if epoch is None else epochs.parse_key(epoch)
     if path.suffix.lower() in (".csv", ".parquet"):
-        times, quaternions, rates = _table(path, order, direction, zero)
-        until = float(times[-1])
+        times, quaternions, rates = _read_table(path, order, direction, start_epoch)
+        usable_until = float(times[-1])
     else:
         for key, value in (("quaternion_order", order), ("direction", direction)):
             if value is not None:
                 raise ValueError(f"an attitude ephemeris message, which states its own {key}; allowed is none")
-        segment = aem.segment(_text(path), zero, any_interpolation=interpolation == "spline")
-        times, quaternions, rates, until = segment
-    return _checked(times, quaternions, rates, min(until, float(times[-1])))
+        segment = aem.read_segment(_read_text(path), start_epoch, any_interpolation=interpolation == "spline")
+        times, quaternions, rates, usable_until = segment
+    return _check_samples(times, quaternions, rates, min(usable_until, float(times[-1])))
 
 
-def _text(path: Path) -> str:
+def _read_text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError):
         raise ValueError("which is no text in UTF-8; allowed are .csv, .parquet and AEM files (KVN)") from None
 
 
-def _checked(times: np.ndarray, quaternions: np.ndarray, rates: np.ndarray | None, until: float) -> Samples:
+def _check_samples(
+    times: np.ndarray, quaternions: np.ndarray, rates: np.ndarray | None, usable_until: float
+) -> Samples:
     """Return the samples; raise ValueError for times, quaternions and rates that cannot be interpolated."""
     if not 2 <= len(times) <= MOST_SAMPLES:
         raise ValueError(f"which has {len(times)} samples, but must have 2 to {MOST_SAMPLES}")
@@ -91,7 +93,7 @@ def _checked(times: np.ndarray, quaternions: np.ndarray, rates: np.ndarray | Non
         k = int(np.argmin(steps > 0.0)) + 1
         raise ValueError(f"sample {k + 1}: its time, {times[k]:.12g} s, is not after the time before it, "
                          f"{times[k - 1]:.12g} s")  # fmt: skip
-    if attitude_tables.intervals(times) > attitude_tables.MOST_INTERVALS:
+    if attitude_tables.count_intervals(times) > attitude_tables.MOST_INTERVALS:
         raise ValueError(f"whose times have steps from {steps.min():.3g} to {steps.max():.3g} s; the whole span may be "
                          f"at most {attitude_tables.MOST_INTERVALS} of the smallest step")  # fmt: skip
     norms = np.linalg.norm(quaternions, axis=1)
@@ -99,27 +101,27 @@ def _checked(times: np.ndarray, quaternions: np.ndarray, rates: np.ndarray | Non
         k = int(np.argmax(np.abs(norms - 1.0)))
         raise ValueError(f"sample {k + 1}: the norm of its quaternion is {norms[k]:.6g}, but must be 1 within "
                          f"{LARGEST_NORM_ERROR:g}")  # fmt: skip
-    q = attitude_tables.continuous(quaternions / norms[:, None])
+    q = attitude_tables.with_continuous_signs(quaternions / norms[:, None])
     turns = 4.0 * np.arctan2(np.linalg.norm(np.diff(q, axis=0), axis=1), np.linalg.norm(q[1:] + q[:-1], axis=1))
     if turns.max() > attitude_tables.LARGEST_TURN:
         k = int(np.argmax(turns))
         raise ValueError(f"sample {k + 2}: it is {np.rad2deg(turns[k]):.4g} deg from the sample before it, and at most "
                          f"{np.rad2deg(attitude_tables.LARGEST_TURN):g} deg are allowed")  # fmt: skip
-    ends = None if rates is None else rates[[0, -1]]
-    known = attitude_tables.rates(times, q, ends)
-    largest = np.linalg.norm(known, axis=1).max()
+    end_rates = None if rates is None else rates[[0, -1]]
+    all_rates = attitude_tables.sample_rates(times, q, end_rates)
+    largest = np.linalg.norm(all_rates, axis=1).max()
     if rates is not None:
-        off = np.linalg.norm(attitude_tables.rates(times, q) - rates, axis=1)
-        if off.max() > LARGEST_RATE_ERROR * largest + 1e-9:
-            k = int(np.argmax(off))
+        errors = np.linalg.norm(attitude_tables.sample_rates(times, q) - rates, axis=1)
+        if errors.max() > LARGEST_RATE_ERROR * largest + 1e-9:
+            k = int(np.argmax(errors))
             raise ValueError(f"sample {k + 1}: its rate differs from the derivative of its quaternions by "
-                             f"{off[k]:.3g} rad/s; rates are body rates in rad/s, in an AEM in deg/s")  # fmt: skip
-    acceleration = (np.linalg.norm(np.diff(known, axis=0), axis=1) / steps).max()
-    return Samples(times, q, ends, until, float(largest + np.sqrt(acceleration)))
+                             f"{errors[k]:.3g} rad/s; rates are body rates in rad/s, in an AEM in deg/s")  # fmt: skip
+    acceleration = (np.linalg.norm(np.diff(all_rates, axis=0), axis=1) / steps).max()
+    return Samples(times, q, end_rates, usable_until, float(largest + np.sqrt(acceleration)))
 
 
-def _table(
-    path: Path, order: str | None, direction: str | None, zero: Epoch | None
+def _read_table(
+    path: Path, order: str | None, direction: str | None, start_epoch: Epoch | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Return times (n,) [s], quaternions (n, 4) and rates (n, 3) [rad/s] or None of a CSV or Parquet file."""
     import polars as pl  # the import takes 0.1 s, and most scenarios do not need it
@@ -131,38 +133,38 @@ def _table(
     except (OSError, ValueError, pl.exceptions.PolarsError) as error:
         raise ValueError((str(error).splitlines() or [type(error).__name__])[0]) from None
     names = {name.strip().lower(): name for name in frame.columns}
-    time = next((name for name in TIMES if name in names), None)
-    if time is None:
-        raise ValueError(f"which has no column of times; allowed is one of {', '.join(TIMES)}")
-    columns, last = _quaternion_columns(names, order)
-    quaternions = np.stack([_numbers(frame, names[name]) for name in columns], axis=1)
-    quaternions = quaternions if last else np.roll(quaternions, -1, axis=1)
+    time_name = next((name for name in TIME_NAMES if name in names), None)
+    if time_name is None:
+        raise ValueError(f"which has no column of times; allowed is one of {', '.join(TIME_NAMES)}")
+    columns, scalar_last = _quaternion_columns(names, order)
+    quaternions = np.stack([_read_numbers(frame, names[name]) for name in columns], axis=1)
+    quaternions = quaternions if scalar_last else np.roll(quaternions, -1, axis=1)
     if direction == "inertial_to_body":
         quaternions = quaternions * attitude_tables.CONJUGATE
-    group = next((group for group in RATES if any(name in names for name in group)), None)
-    absent = next((name for name in group or () if name not in names), None)
-    if absent is not None:
-        raise ValueError(f"which has no column {absent}: {', '.join(group or ())} come together")
-    rates = None if group is None else np.stack([_numbers(frame, names[name]) for name in group], axis=1)
-    return _times(frame, names[time], zero), quaternions, rates
+    rate_names = next((rate_names for rate_names in RATE_NAMES if any(name in names for name in rate_names)), None)
+    missing = next((name for name in rate_names or () if name not in names), None)
+    if missing is not None:
+        raise ValueError(f"which has no column {missing}: {', '.join(rate_names or ())} come together")
+    rates = None if rate_names is None else np.stack([_read_numbers(frame, names[name]) for name in rate_names], axis=1)
+    return _read_times(frame, names[time_name], start_epoch), quaternions, rates
 
 
 def _quaternion_columns(names: dict[str, str], order: str | None) -> tuple[tuple[str, ...], bool]:
     """Return the columns of the quaternion, and whether the scalar part is the last one."""
-    for group, last in (*((group, True) for group in LAST), *((group, False) for group in FIRST)):
+    for group, scalar_last in (*((group, True) for group in SCALAR_LAST), *((group, False) for group in SCALAR_FIRST)):
         if all(name in names for name in group):
-            if order not in (None, "xyzw" if last else "wxyz"):
+            if order not in (None, "xyzw" if scalar_last else "wxyz"):
                 raise ValueError(
                     f'whose columns {", ".join(group)} label the scalar part; quaternion_order is "{order}"'
                 )
-            return group, last
-    if all(name in names for name in NUMBERED):
-        return NUMBERED, order != "wxyz"
+            return group, scalar_last
+    if all(name in names for name in UNLABELLED):
+        return UNLABELLED, order != "wxyz"
     raise ValueError("which has no quaternion; allowed are the columns q1, q2, q3, q4 or qx, qy, qz, qw or q0 to q3 "
                      "with the scalar q0")  # fmt: skip
 
 
-def _numbers(frame: Any, name: str) -> np.ndarray:
+def _read_numbers(frame: Any, name: str) -> np.ndarray:
     """Return a column as finite numbers (n,)."""
     values = np.empty(frame.height)
     for k, cell in enumerate(frame[name].to_list()):
@@ -176,15 +178,15 @@ def _numbers(frame: Any, name: str) -> np.ndarray:
     return values
 
 
-def _times(frame: Any, name: str, zero: Epoch | None) -> np.ndarray:
+def _read_times(frame: Any, name: str, start_epoch: Epoch | None) -> np.ndarray:
     """Return the times (n,) [s], from numbers of seconds or calendar times."""
     cells = frame[name].to_list()
     if not cells or not (hasattr(cells[0], "isoformat") or (isinstance(cells[0], str) and "T" in cells[0])):
-        return _numbers(frame, name)
-    found = []
+        return _read_numbers(frame, name)
+    times = []
     for k, cell in enumerate(cells):
         try:
-            found.append(epochs.parse(cell.isoformat() if hasattr(cell, "isoformat") else str(cell)))
+            times.append(epochs.parse(cell.isoformat() if hasattr(cell, "isoformat") else str(cell)))
         except ValueError as error:
             raise ValueError(f'row {k + 1}, column {name}: it is "{cell}", {error}') from None
-    return np.array([one.since(zero or found[0]) for one in found])
+    return np.array([time.since(start_epoch or times[0]) for time in times])

@@ -33,16 +33,16 @@ class Attitude(Table, frozen=True):
 ATTITUDE_KEYS = ("quat_xyzw", "quat_wxyz", "rotvec_deg", "mrp", "dcm_body_to_inertial", "euler_deg")
 
 
-def unit(key: str, value: Any) -> np.ndarray:
-    """Return a quaternion (4,) normalised; raise ScenarioError if its norm is not 1 within 1e-6.
+def unit_quaternion(key: str, value: Any) -> np.ndarray:
+    """Return a quaternion (4,) divided by its norm; raise ScenarioError if the norm is not 1 within 1e-6.
 
-    The order of the components stays. `key` is the full name of the key for errors, such as "initial.quat_xyzw".
+    The order of the components does not change. `key` is the full key for errors, such as "initial.quat_xyzw".
     """
     array = np.array(value, dtype=float)
-    length = np.linalg.norm(array)
-    if abs(length - 1.0) > 1e-6:
-        raise wrong(key, value, f"a unit quaternion (its norm is {length:.9g}, allowed is 1 within 1e-6)")
-    return array / length
+    norm = np.linalg.norm(array)
+    if abs(norm - 1.0) > 1e-6:
+        raise wrong(key, value, f"a unit quaternion (its norm is {norm:.9g}, allowed is 1 within 1e-6)")
+    return array / norm
 
 
 def quaternion(table: Attitude, name: str) -> np.ndarray:
@@ -51,37 +51,39 @@ def quaternion(table: Attitude, name: str) -> np.ndarray:
     It raises ScenarioError if the value is not an attitude. `name` is the table's name, for errors.
     """
     key, value = attitude_key(table)
-    full = f"{name}.{key}"
+    full_key = f"{name}.{key}"
     if table.sequence is not None and key != "euler_deg":
         raise ScenarioError(
             f"{name}.sequence is {errors.brief(table.sequence)}, but is allowed only together with euler_deg"
         )
     if key in ("quat_xyzw", "quat_wxyz"):
-        given = unit(full, value)
-        return given if key == "quat_xyzw" else np.roll(given, -1)
+        unit = unit_quaternion(full_key, value)
+        return unit if key == "quat_xyzw" else np.roll(unit, -1)
     with np.errstate(all="ignore"):  # the norm below detects an overflow
-        found = _turned(table, name, full, np.array(value, dtype=float))
-    if not abs(np.linalg.norm(found) - 1.0) < 1e-6:
-        raise wrong(full, value, "an attitude in numbers whose squares are finite")
-    return found
+        converted = _convert_rotation(table, name, full_key, np.array(value, dtype=float))
+    if not abs(np.linalg.norm(converted) - 1.0) < 1e-6:
+        raise wrong(full_key, value, "an attitude in numbers whose squares are finite")
+    return converted
 
 
-def _turned(table: Attitude, name: str, full: str, array: np.ndarray) -> np.ndarray:
+def _convert_rotation(table: Attitude, name: str, full_key: str, array: np.ndarray) -> np.ndarray:
     """Return the quaternion (4,) of an attitude key that holds another parametrisation."""
     from scipy.spatial.transform import Rotation  # the import takes 0.15 s, and most scenarios do not need it
 
-    key = full.removeprefix(f"{name}.")
+    key = full_key.removeprefix(f"{name}.")
     if key == "rotvec_deg":
         return Rotation.from_rotvec(array, degrees=True).as_quat(canonical=True)
     if key == "mrp":
         return Rotation.from_mrp(array).as_quat(canonical=True)
     if key == "dcm_body_to_inertial":
-        off = np.abs(array @ array.T - np.eye(3)).max()
-        if not off <= 1e-6 or np.linalg.det(array) < 0:
-            raise wrong(full, array.tolist(), "a rotation matrix (orthonormal within 1e-6, determinant +1)")
+        deviation = np.abs(array @ array.T - np.eye(3)).max()
+        if not deviation <= 1e-6 or np.linalg.det(array) < 0:
+            raise wrong(full_key, array.tolist(), "a rotation matrix (orthonormal within 1e-6, determinant +1)")
         return Rotation.from_matrix(array).as_quat(canonical=True)
     if table.sequence is None:
-        raise ScenarioError(f'{full} needs {name}.sequence beside it, three axes in SciPy\'s notation, such as "ZYX"')
+        raise ScenarioError(
+            f'{full_key} needs {name}.sequence beside it, three axes in SciPy\'s notation, such as "ZYX"'
+        )
     try:
         return Rotation.from_euler(table.sequence, array, degrees=True).as_quat(canonical=True)
     except ValueError:
@@ -101,9 +103,9 @@ def attitude_key(table: Attitude) -> tuple[str, Any]:
     return key, getattr(table, key)
 
 
-def at_most_one(name: str, table: Any) -> None:
-    """Raise ScenarioError if a table has more than one attitude key; name: of the table, for errors."""
+def check_single_attitude(name: str, table: Any) -> None:
+    """Raise ScenarioError if a table has more than one attitude key; `name`: the table's name."""
     present = [key for key in ATTITUDE_KEYS if getattr(table, key) is not None]
     if len(present) > 1:
-        two, allowed = " and ".join(present), ", ".join(ATTITUDE_KEYS)
-        raise ScenarioError(f"{name} has the attitude keys {two}, but must have exactly one of {allowed}")
+        shown, allowed = " and ".join(present), ", ".join(ATTITUDE_KEYS)
+        raise ScenarioError(f"{name} has the attitude keys {shown}, but must have exactly one of {allowed}")

@@ -20,29 +20,31 @@ from ptsmc_jax.simulation.assembly import Parts, Setup
 
 
 def setup(scenario: Scenario) -> Setup:
-    """Return all parts except the clock. `timing.timing` derives the clock from the fastest rates of these parts."""
-    model = scenario.model()
-    plant = scenario.truth(model)
-    acting, walk = disturbance(scenario, plant)
+    """Return all parts except the clock, which `timing.choose_timing` derives from the fastest rates of these parts."""
+    model = scenario.design_model()
+    plant = scenario.true_plant(model)
+    signal, walk_rate = disturbance(scenario, plant)
     wheels = scenario.reaction_wheels
-    devices = scenario.devices.actuators(None if wheels is None else wheels.build())
+    actuators = scenario.devices.actuators(None if wheels is None else wheels.build())
     if getattr(getattr(scenario.dispersion, "wheel_failure", None), "known", False):
-        devices = dataclasses.replace(devices, spare_allocations=reaction_wheels.spare_allocations(devices.wheels))
-    filtering = scenario.devices.command_filter
+        actuators = dataclasses.replace(
+            actuators, spare_allocations=reaction_wheels.spare_allocations(actuators.wheels)
+        )
+    command_filter = scenario.devices.command_filter
     return Setup(
         plant=plant,
-        disturbance=acting,
-        reference=scenario.target(),
+        disturbance=signal,
+        reference=scenario.build_reference(),
         controller=scenario.controller.build(scenario, model),
         observer=scenario.observer.build(scenario, model),
         sensors=_sensors(scenario, model),
-        initial=plant.with_hidden_at_rest(scenario.start()),
+        initial=plant.with_hidden_at_rest(scenario.initial_state()),
         t_end=vector(scenario.end),
         window=vector(scenario.window),
         settling_angle=vector(scenario.loop.settling_angle),
-        actuators=devices,
-        walk_rate=walk,
-        command_filter=None if filtering is None else filtering.part(),
+        actuators=actuators,
+        walk_rate=walk_rate,
+        command_filter=None if command_filter is None else command_filter.part(),
         pointing=scenario.observation(),
     )
 
@@ -59,22 +61,22 @@ def disturbance(scenario: Scenario, plant: Plant) -> tuple[Any, Any]:
 
     The rate of the random walk is one sigma per second for each input (m,).
     """
-    signal, walk = [], None
+    signals, walk = [], None
     inertia = getattr(plant, "inertia", None)
     for table in scenario.terms:
-        acting, step = table.build(inertia, scenario), table.walk(scenario.loop.period)
-        signal += [] if acting is None else [acting]
+        signal, step = table.build(inertia, scenario), table.walk(scenario.loop.period)
+        signals += [] if signal is None else [signal]
         if step is not None:
             walk = step if walk is None else jnp.sqrt(walk**2 + step**2)  # variances of independent walks add up
-    if len(signal) > 1:
-        return disturbances.Sum(tuple(signal)), walk
-    return (signal[0] if signal else disturbances.Constant(jnp.zeros(plant.inputs))), walk
+    if len(signals) > 1:
+        return disturbances.Sum(tuple(signals)), walk
+    return (signals[0] if signals else disturbances.Constant(jnp.zeros(plant.inputs))), walk
 
 
-def _quantity_of(key: str) -> str:
+def _dispersed_quantity(key: str) -> str:
     """Return the name of the quantity that a key of [dispersion] disperses."""
-    initial = {"attitude": INITIAL_ATTITUDE, "rate": INITIAL_RATE, "x0": INITIAL_STATE}
-    return initial.get(key, level_name(key) if level_name(key) in QUANTITIES else key)
+    initial_values = {"attitude": INITIAL_ATTITUDE, "rate": INITIAL_RATE, "x0": INITIAL_STATE}
+    return initial_values.get(key, level_name(key) if level_name(key) in QUANTITIES else key)
 
 
 def dispersion(scenario: Scenario, parts: Parts) -> Dispersion:
@@ -83,13 +85,13 @@ def dispersion(scenario: Scenario, parts: Parts) -> Dispersion:
     if table is None:
         return Dispersion()
     keys: tuple[str, ...] = table.__struct_fields__
-    tables: dict[str, Any] = {_quantity_of(key): getattr(table, key) for key in keys if key != "custom"}
+    tables: dict[str, Any] = {_dispersed_quantity(key): getattr(table, key) for key in keys if key != "custom"}
     return Dispersion(
         {
-            name: one.build(parts, QUANTITIES[name].count(parts))
-            for name, one in tables.items()
-            # hardware errors of zero size are omitted: the compiled program is then the program without them
-            if one is not None and not (QUANTITIES[name].hardware and getattr(one, "nothing", False))
+            name: random.build(parts, QUANTITIES[name].count(parts))
+            for name, random in tables.items()
+            # zero hardware errors are omitted, so that the compiled program is the one without hardware errors
+            if random is not None and not (QUANTITIES[name].hardware and getattr(random, "is_zero", False))
         },
         custom=None if table.custom is None else table.custom.build(),
     )

@@ -12,12 +12,13 @@ from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.values import MOST_STEPS
 from ptsmc_jax.simulation import catalogues
 
-OF_SENSORS = ("star_tracker_misalignment", "gyro_scale", "star_tracker_outage")  # dispersions of the built-in sensors
-SENSOR_ERRORS = ("gyro_scale", "star_tracker_misalignment_deg")  # keys of [hardware]
+# dispersions of the built-in sensors
+SENSOR_DISPERSIONS = ("star_tracker_misalignment", "gyro_scale", "star_tracker_outage")
+SENSOR_ERROR_KEYS = ("gyro_scale", "star_tracker_misalignment_deg")  # keys of [hardware]
 SHORTEST_WINDOW = 1e-5  # fraction of t_f, continuous loop: 80 times the resolution of a 32-bit float at t_f
 
 
-def check(scenario: Scenario) -> None:
+def check_keys(scenario: Scenario) -> None:
     """Raise ScenarioError if keys contradict each other or if their combination is not supported."""
     scenario.check_plant()
     _check_requirements(scenario)
@@ -33,20 +34,20 @@ def _check_requirements(scenario: Scenario) -> None:
         if table is not None and getattr(scenario, table, None) is None:
             raise ScenarioError(f"requirements.{key} needs [{table}], but there is no [{table}] table")
         if key.startswith(catalogues.WITHIN):
-            ask = '{ limit = .., probability = .., interpretation = "mixed" }'
+            example = '{ limit = .., probability = .., interpretation = "mixed" }'
             name = f"requirements.{key.removeprefix(catalogues.WITHIN)}"
             raise ScenarioError(
-                f"requirements.{key} is not a limit but a fraction of the time; allowed is {name} = {ask}"
+                f"requirements.{key} is not a limit but a fraction of the time; allowed is {name} = {example}"
             )
-        if key.startswith(catalogues.KNOWLEDGE) and not scenario.measured:
+        if key.startswith(catalogues.KNOWLEDGE) and not scenario.uses_measurements:
             raise ScenarioError(
                 f"requirements.{key} needs sensor noise in [hardware], but there is none: the law has the true state"
             )
         if isinstance(value, tables.Limit):
             _check_limit(key, value)
         if key in catalogues.MARGINS:
-            scenario.need_samples(f"requirements.{key}")
-            if scenario.exact_sign:
+            scenario.require_sampled_loop(f"requirements.{key}")
+            if scenario.has_discontinuous_sign:
                 raise ScenarioError(
                     f"requirements.{key} needs a boundary layer, but controller.sign_width is 0, a discontinuous sign; "
                     "allowed is a number greater than 0"
@@ -66,15 +67,17 @@ def _check_limit(metric: str, limit: tables.Limit) -> None:
         )
     if limit.interpretation in (None, "ensemble"):
         return
-    stated = f"{key}.interpretation is {errors.show(limit.interpretation)}"
-    if metric not in catalogues.AT_A_TIME:
-        known = ", ".join(catalogues.AT_A_TIME)
-        raise ScenarioError(f'{stated}, but must be "ensemble": only {known} can be judged by a fraction of the time')
+    beginning = f"{key}.interpretation is {errors.show(limit.interpretation)}"
+    if metric not in catalogues.TIME_FRACTION_METRICS:
+        metrics = ", ".join(catalogues.TIME_FRACTION_METRICS)
+        raise ScenarioError(
+            f'{beginning}, but must be "ensemble": only {metrics} can be judged by a fraction of the time'
+        )
     if limit.probability is None:
-        raise ScenarioError(f"{stated}, which needs the key probability, the fraction of the time")
+        raise ScenarioError(f"{beginning}, which needs the key probability, the fraction of the time")
     if limit.interpretation == "temporal" and limit.confidence is not None:
         raise ScenarioError(
-            f"{stated}, which every simulated run must keep, but confidence is {limit.confidence}; "
+            f"{beginning}, which every simulated run must keep, but confidence is {limit.confidence}; "
             'allowed is no confidence, or the interpretation "ensemble" or "mixed"'
         )
 
@@ -86,8 +89,8 @@ def check_sensors(scenario: Scenario) -> None:
     """
     if scenario.sensors is None:
         return
-    scenario.need_samples("[sensors]")
-    for key in (*scenario.devices.noises, *SENSOR_ERRORS, "star_tracker_every", "star_tracker_period"):
+    scenario.require_sampled_loop("[sensors]")
+    for key in (*scenario.devices.noise_keys, *SENSOR_ERROR_KEYS, "star_tracker_every", "star_tracker_period"):
         value = getattr(scenario.hardware, key, None)
         if value is not None:
             raise wrong(f"hardware.{key}", value, "absent, because [sensors] defines the measurements")
@@ -95,8 +98,10 @@ def check_sensors(scenario: Scenario) -> None:
         raise ScenarioError(
             'filter.kind is "steady_state", but must be absent, because [sensors] defines the measurements'
         )
-    noises = (key for key, given_by in scenario.devices.levels.items() if set(given_by) <= {*scenario.devices.noises})
-    for key in (*noises, *OF_SENSORS):
+    noise_dispersions = (
+        key for key, set_by in scenario.devices.nominal_keys.items() if set(set_by) <= {*scenario.devices.noise_keys}
+    )
+    for key in (*noise_dispersions, *SENSOR_DISPERSIONS):
         if getattr(scenario.dispersion, key, None) is not None:
             raise ScenarioError(
                 f"dispersion.{key} changes the sensors of [hardware], but [sensors] replaces them; allowed is "
@@ -108,11 +113,11 @@ def _check_loop(scenario: Scenario) -> None:
     controller, loop = scenario.controller, scenario.loop
     t_f, delta, window = controller.t_f, scenario.hand_over, scenario.window
     if loop.epoch is not None:
-        epochs.of_key(loop.epoch)
+        epochs.parse_key(loop.epoch)
     if not controller.law.prescribed:
-        scenario.need_samples(f"controller.kind = {errors.show(controller.kind)}")
+        scenario.require_sampled_loop(f"controller.kind = {errors.show(controller.kind)}")
     controller.check(scenario)
-    if scenario.sampled and t_f <= loop.period:  # before delta is checked, which is at least one period
+    if scenario.sampled and t_f <= loop.period:  # checked before delta, which must be at least one period
         raise wrong("controller.t_f", t_f, f"greater than one control period, loop.period = {loop.period}")
     if delta >= t_f:
         raise wrong("controller.delta", delta, f"less than controller.t_f, {t_f}")
@@ -128,39 +133,39 @@ def _check_loop(scenario: Scenario) -> None:
         )
     for key in scenario.hardware.__struct_fields__ if scenario.hardware is not None else ():
         if getattr(scenario.hardware, key) is not None:
-            scenario.need_samples(f"hardware.{key}")
-    for name, on in (("wheels", scenario.reaction_wheels is not None), ("filter", scenario.estimator.on)):
-        if on:
-            scenario.need_samples(f"[{name}]")
-    for place, term in scenario.placed_terms.items():
+            scenario.require_sampled_loop(f"hardware.{key}")
+    for name, present in (("wheels", scenario.reaction_wheels is not None), ("filter", scenario.estimator.on)):
+        if present:
+            scenario.require_sampled_loop(f"[{name}]")
+    for key, term in scenario.terms_by_place.items():
         if term.sampled_only:
-            scenario.need_samples(f"{place}.kind = {errors.show(term.kind)}")
+            scenario.require_sampled_loop(f"{key}.kind = {errors.show(term.kind)}")
 
 
 def _check_periods(scenario: Scenario) -> None:
     """Raise ScenarioError if a time or a number of control periods does not fit the period or the run."""
-    loop, window, filtering = scenario.loop, scenario.window, scenario.devices.command_filter
+    loop, window, command_filter = scenario.loop, scenario.window, scenario.devices.command_filter
     delta = scenario.hand_over
     if delta < loop.period * (1 - 1e-9):
         raise wrong("controller.delta", delta, f"at least one control period, loop.period = {loop.period}")
     if scenario.end / loop.period > MOST_STEPS:
         raise wrong("loop.period", loop.period, f"at least loop.t_end / {MOST_STEPS}, {scenario.end / MOST_STEPS}")
-    if filtering is not None and filtering.corner >= math.pi / loop.period:
+    if command_filter is not None and command_filter.corner >= math.pi / loop.period:
         highest = f"below pi / loop.period = {math.pi / loop.period:.6g}, the Nyquist frequency"
-        raise wrong("hardware.command_filter.corner", filtering.corner, highest)
+        raise wrong("hardware.command_filter.corner", command_filter.corner, highest)
     if window < loop.period * (1 - 1e-9):
         raise wrong("loop.window", window, f"at least one control period, loop.period = {loop.period}")
     delay, t_f = scenario.devices.delay_periods, scenario.controller.t_f
     if delay * loop.period >= t_f:
-        least = f"a number of control periods ({loop.period:g} s each) that is shorter than controller.t_f, {t_f:g} s"
-        raise wrong("hardware.delay", delay, least)
+        allowed = f"a number of control periods ({loop.period:g} s each) that is shorter than controller.t_f, {t_f:g} s"
+        raise wrong("hardware.delay", delay, allowed)
     samples = math.ceil(scenario.end / loop.period * (1 - 1e-9))
     every = getattr(scenario.hardware, "star_tracker_every", None) or 0
     if every > samples:
         raise wrong("hardware.star_tracker_every", every, f"at most the {samples} control periods until loop.t_end")
-    star = getattr(scenario.hardware, "star_tracker_period", None) or 0.0
-    if star > scenario.end:
-        raise wrong("hardware.star_tracker_period", star, f"at most loop.t_end, {scenario.end}")
+    tracker_period = getattr(scenario.hardware, "star_tracker_period", None) or 0.0
+    if tracker_period > scenario.end:
+        raise wrong("hardware.star_tracker_period", tracker_period, f"at most loop.t_end, {scenario.end}")
 
 
 def _check_dispersion(scenario: Scenario) -> None:
@@ -168,71 +173,71 @@ def _check_dispersion(scenario: Scenario) -> None:
     kinds: Any = scenario.TABLES["disturbance"]
     if getattr(scenario, "orbit", None) is not None:  # the gravity gradient of [orbit] has no dispersion
         kinds = {kind: one for kind, one in kinds.items() if kind != "gravity_gradient"}
-    for article, what in (("a", "phase"), ("an", "amplitude")):
-        asked = getattr(dispersion, f"disturbance_{what}", None) is not None
-        if asked and not any(_has(term, what) for term in scenario.terms if term.kind in kinds):
-            allowed = " or ".join(errors.show(kind) for kind, one in kinds.items() if what in one.__struct_fields__)
+    for article, quantity in (("a", "phase"), ("an", "amplitude")):
+        dispersed = getattr(dispersion, f"disturbance_{quantity}", None) is not None
+        if dispersed and not any(_has_random_key(term, quantity) for term in scenario.terms if term.kind in kinds):
+            allowed = " or ".join(errors.show(kind) for kind, one in kinds.items() if quantity in one.__struct_fields__)
             raise ScenarioError(
-                f"dispersion.disturbance_{what} needs a disturbance that has {article} {what}, but disturbance.kind is "
-                f"{errors.show(scenario.disturbance.kind)}; allowed is {allowed}"
+                f"dispersion.disturbance_{quantity} needs a disturbance that has {article} {quantity}, but "
+                f"disturbance.kind is {errors.show(scenario.disturbance.kind)}; allowed is {allowed}"
             )
-    for key, given_by in scenario.devices.levels.items():
-        given = any(getattr(scenario.devices, one) is not None for one in given_by)
-        if getattr(dispersion, key, None) is not None and not given:
+    for key, nominal_keys in scenario.devices.nominal_keys.items():
+        has_nominal = any(getattr(scenario.devices, one) is not None for one in nominal_keys)
+        if getattr(dispersion, key, None) is not None and not has_nominal:
             raise ScenarioError(f"dispersion.{key} needs hardware.{key}, which is absent")
-    _check_misfits(scenario)
+    _check_hardware_dispersions(scenario)
     for key in ("attitude", "reference"):
         angles = getattr(dispersion, key, None)
         if angles is not None and getattr(angles, "min_deg", 0.0) > getattr(angles, "max_deg", 180.0):
             raise wrong(f"dispersion.{key}.min_deg", angles.min_deg, f"at most max_deg, {angles.max_deg}")
-    drawn = getattr(dispersion, "x0", None)
-    if drawn is not None:
-        key, states = drawn.width, len(scenario.plant.x0)
-        value = getattr(drawn, key)
-        if len(value) != states:
-            raise wrong(f"dispersion.x0.{key}", value, f"a list of {states} numbers, one for each state")
+    initial_state = getattr(dispersion, "x0", None)
+    if initial_state is not None:
+        key, state_count = initial_state.width_key, len(scenario.plant.x0)
+        value = getattr(initial_state, key)
+        if len(value) != state_count:
+            raise wrong(f"dispersion.x0.{key}", value, f"a list of {state_count} numbers, one for each state")
 
 
-def _has(term: Any, what: str) -> bool:
+def _has_random_key(term: Any, quantity: str) -> bool:
     """Whether a dispersion can change the phase or the amplitude of a disturbance.
 
     A custom disturbance declares this in `drawn`. A custom key of that name alone does not suffice.
     """
     if isinstance(term, custom.Custom):
-        return term.waits or what in term.made.drawn
-    return hasattr(term, what)
+        return term.is_unloaded or quantity in term.part_class.drawn
+    return hasattr(term, quantity)
 
 
-def _check_misfits(scenario: Scenario) -> None:
+def _check_hardware_dispersions(scenario: Scenario) -> None:
     dispersion, devices = scenario.dispersion, scenario.devices
 
-    def asked(*keys: str) -> list[str]:
+    def dispersed(*keys: str) -> list[str]:
         return [key for key in keys if getattr(dispersion, key, None) is not None]
 
-    for key in asked("actuator_scale", "actuator_misalignment", "timing_jitter"):
-        scenario.need_samples(f"dispersion.{key}")
+    for key in dispersed("actuator_scale", "actuator_misalignment", "timing_jitter"):
+        scenario.require_sampled_loop(f"dispersion.{key}")
     for key, name in (("star_tracker_misalignment", "attitude_noise"), ("gyro_scale", "rate_noise")):
-        given = any(getattr(devices, one) is not None for one in devices.levels.get(name, ()))
-        if asked(key) and not given:
+        has_nominal = any(getattr(devices, one) is not None for one in devices.nominal_keys.get(name, ()))
+        if dispersed(key) and not has_nominal:
             raise ScenarioError(f"dispersion.{key} needs hardware.{name}, which is absent; {name} = 0 is allowed")
-    if asked("wheel_failure") and scenario.reaction_wheels is None:
+    if dispersed("wheel_failure") and scenario.reaction_wheels is None:
         raise ScenarioError("dispersion.wheel_failure needs reaction wheels, but there is no [wheels] table")
-    if asked("star_tracker_outage") and not scenario.estimator.on:
+    if dispersed("star_tracker_outage") and not scenario.estimator.on:
         raise ScenarioError(
             "dispersion.star_tracker_outage needs an attitude filter, which estimates the attitude in the outage; "
             'allowed is [filter] with kind = "steady_state"'
         )
-    for key in asked("star_tracker_outage", "wheel_failure"):
+    for key in dispersed("star_tracker_outage", "wheel_failure"):
         times = getattr(dispersion, key)
         latest = scenario.end if times.latest is None else times.latest
         if times.earliest > latest:
             raise wrong(f"dispersion.{key}.earliest", times.earliest, f"at most {latest}, the latest time")
-    for key in asked("timing_jitter"):
+    for key in dispersed("timing_jitter"):
         jitter = getattr(dispersion, key)
         if not jitter.largest < 0.5:
             raise wrong(f"dispersion.{key}.largest", jitter.largest, "below 0.5, half a control period")
         if jitter.smallest > jitter.largest:
             raise wrong(f"dispersion.{key}.smallest", jitter.smallest, f"at most {jitter.largest}, the largest")
-    for key in asked("mode_frequency", "mode_coupling"):
+    for key in dispersed("mode_frequency", "mode_coupling"):
         if getattr(scenario, "flexible", None) is None:
             raise ScenarioError(f"dispersion.{key} needs flexible modes, but there is no [flexible] table")

@@ -1,7 +1,7 @@
 """Custom parts of scenarios: `kind = "custom"` and `code = "FILE.py:NAME"`, a class whose fields are further keys.
 
 Reading a scenario does not run the code that it names. Until `reading.complete` runs it, these keys are in `rest` and
-are not validated. Start with `custom_kind` and `read`.
+are not validated. Start with `custom_kind` and `load_table`.
 """
 
 import dataclasses
@@ -22,82 +22,87 @@ from ptsmc_jax.scenario.errors import ScenarioError, brief, show
 from ptsmc_jax.scenario.values import Meaning, Table
 from ptsmc_jax.simulation.gains import is_reserved
 
-KEYS = ("system", "truth", "code")  # keys that name code, in any table
-DATA = "reference.file"  # key that names a data file
-CONTROLLER = "--controller"  # option that names the exported C code, unlike the key `controller.code`
-DECLARED = "delta"  # field of the base class that a custom law may declare again, as a gain
-Code = Annotated[Any, Meta(description=systems.WHERE), Meaning('the class, "FILE.py:NAME" or "package.module:NAME"')]
+CODE_KEYS = ("system", "truth", "code")  # keys that name code, in any table
+DATA_FILE_KEY = "reference.file"  # key that names a data file
+CONTROLLER_OPTION = "--controller"  # option that names the exported C code, unlike the key `controller.code`
+REDECLARABLE_FIELD = "delta"  # field of the base class that a custom law may declare again, as a gain
+Code = Annotated[
+    Any, Meta(description=systems.NAME_FORMS), Meaning('the class, "FILE.py:NAME" or "package.module:NAME"')
+]
 
 
 class Custom:
-    """The tables of custom parts; their keys `kind`, `code` and `rest` are in `custom_kind`."""
+    """Base class of the tables of custom parts. `custom_kind` adds the keys `kind`, `code` and `rest`."""
 
     __slots__ = ()
     base: ClassVar[Any] = None  # required base class of the custom class
-    needs: ClassVar[tuple[str, ...]] = ()  # methods: the custom class must define at least one of them
-    tuned: ClassVar[bool] = False  # whether the custom class may have gains
-    made: ClassVar[Any] = None  # the custom class, None until its code has run
+    required_methods: ClassVar[tuple[str, ...]] = ()  # methods: the custom class must define at least one of them
+    has_gains: ClassVar[bool] = False  # whether the custom class may have gains
+    part_class: ClassVar[Any] = None  # the custom class, None until its code has run
 
     @property
-    def waits(self) -> bool:
+    def is_unloaded(self) -> bool:
         """Whether the code has not run yet."""
-        return self.made is None
+        return self.part_class is None
 
 
-def custom_kind(table: Any, base: type, needs: tuple[str, ...], summary: str, tuned: bool = False) -> Any:
+def custom_kind(
+    table: Any, base: type, required_methods: tuple[str, ...], summary: str, has_gains: bool = False
+) -> Any:
     """Return the table of custom parts.
 
     Args:
         table: the table class that custom and built-in parts share.
         base: the required base class of custom classes.
-        needs: methods; a custom class must define at least one of them.
+        required_methods: methods; a custom class must define at least one of them.
         summary: description of the kind.
-        tuned: whether a custom class may have gains.
+        has_gains: whether a custom class may have gains.
     """
-    return _custom_kind(table, base, needs, summary, tuned)
+    return _custom_kind(table, base, required_methods, summary, has_gains)
 
 
 @functools.cache
-def _custom_kind(table: Any, base: type, needs: tuple[str, ...], summary: str, tuned: bool) -> Any:
-    space = {"__doc__": summary, "base": base, "needs": needs, "tuned": tuned, "__module__": __name__}
-    space["remake"] = (_custom_kind, table, base, needs, summary, tuned)
-    rest = ("rest", dict[str, Any], msgspec.field(default_factory=dict))
-    fields = [("kind", Literal["custom"], "custom"), ("code", Code), rest]
-    return msgspec.defstruct("Custom", fields, bases=(Custom, table), frozen=True, kw_only=True, namespace=space)
+def _custom_kind(table: Any, base: type, required_methods: tuple[str, ...], summary: str, has_gains: bool) -> Any:
+    namespace = {"__doc__": summary, "base": base, "required_methods": required_methods, "has_gains": has_gains}
+    namespace["__module__"] = __name__
+    namespace["pickle_arguments"] = (_custom_kind, table, base, required_methods, summary, has_gains)
+    rest_field = ("rest", dict[str, Any], msgspec.field(default_factory=dict))
+    fields = [("kind", Literal["custom"], "custom"), ("code", Code), rest_field]
+    return msgspec.defstruct("Custom", fields, bases=(Custom, table), frozen=True, kw_only=True, namespace=namespace)
 
 
-def named(raw: Mapping[str, Any]) -> Iterator[tuple[dict, str]]:
-    """Yield each table of a parsed file that names code, nested tables included, with the key that names it."""
-    for table in _tables(raw):
-        for key in KEYS:
+def find_code_keys(file: Mapping[str, Any]) -> Iterator[tuple[dict, str]]:
+    """Yield each table of a parsed file that names custom code, nested tables included, and the key that names it."""
+    for table in _walk_tables(file):
+        for key in CODE_KEYS:
             if isinstance(table.get(key), str):
                 yield table, key
 
 
-def _tables(value: Any) -> Iterator[dict]:
-    inside = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+def _walk_tables(value: Any) -> Iterator[dict]:
+    children = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
     if isinstance(value, dict):
         yield value
-    for one in inside:
-        yield from _tables(one)
+    for child in children:
+        yield from _walk_tables(child)
 
 
-def programs(scenario: Table) -> dict[str, str]:
+def code_by_key(scenario: Table) -> dict[str, str]:
     """Return the custom code that a scenario runs, "FILE.py:NAME", by the key that names it."""
-    found = {}
-    for place, table in _places(scenario):
-        for key in KEYS:
+    code = {}
+    for name, table in _named_tables(scenario):
+        for key in CODE_KEYS:
             if isinstance(getattr(table, key, None), str):
-                found[f"{place}.{key}"] = getattr(table, key)
-    return found
+                code[f"{name}.{key}"] = getattr(table, key)
+    return code
 
 
-def _places(scenario: Table) -> Iterator[tuple[str, Any]]:
-    """Yield the tables that can name code with their place, those in a sum and in [dispersion] included."""
+def _named_tables(scenario: Table) -> Iterator[tuple[str, Any]]:
+    """Yield the name and the table of each table that can name code, also in a sum of disturbances or [dispersion]."""
     for name in scenario.__struct_fields__:
         table = getattr(scenario, name)
-        if hasattr(table, "placed"):
-            yield from table.placed(name).items()
+        if hasattr(table, "tables_by_name"):
+            yield from table.tables_by_name(name).items()
         elif name == "dispersion" and table is not None:
             yield "dispersion.custom", table.custom
         else:
@@ -112,7 +117,7 @@ def checksum_name(key: str) -> str:
     >>> checksum_name("--metrics"), checksum_name("--controller")  # not the name of `controller.code`
     ('metrics_sha256', 'flight_code_sha256')
     """
-    if key == CONTROLLER:
+    if key == CONTROLLER_OPTION:
         return "flight_code_sha256"
     place = key.removeprefix("plant.").removesuffix(".code").lstrip("-")
     return re.sub(r"\W+", "_", place).strip("_") + "_sha256"
@@ -120,29 +125,29 @@ def checksum_name(key: str) -> str:
 
 def checksums(scenario: Table) -> dict[str, str]:
     """Return the current SHA-256 checksums of the files that a scenario names, by their names in `versions.json`."""
-    found = {checksum_name(key): systems.checksum(where) for key, where in programs(scenario).items()}
-    found |= {checksum_name(key): systems.sha256(file) for key, file in data_files(scenario).items()}
-    return {name: checksum for name, checksum in found.items() if checksum is not None}
+    by_name = {checksum_name(key): systems.checksum(where) for key, where in code_by_key(scenario).items()}
+    by_name |= {checksum_name(key): systems.sha256(file) for key, file in data_files_by_key(scenario).items()}
+    return {name: checksum for name, checksum in by_name.items() if checksum is not None}
 
 
-def data_tables(raw: Mapping[str, Any]) -> list[dict]:
+def find_data_tables(file: Mapping[str, Any]) -> list[dict]:
     """Return the tables of a parsed file that name a data file."""
-    table = raw.get("reference")
+    table = file.get("reference")
     return [table] if isinstance(table, dict) and isinstance(table.get("file"), str) else []
 
 
-def data_files(scenario: Table) -> dict[str, str]:
+def data_files_by_key(scenario: Table) -> dict[str, str]:
     """Return the paths of the data files that a scenario names, by key."""
     file = getattr(getattr(scenario, "reference", None), "file", None)
-    return {} if file is None else {DATA: file}
+    return {} if file is None else {DATA_FILE_KEY: file}
 
 
-def waits(scenario: Table) -> bool:
+def has_unloaded_code(scenario: Table) -> bool:
     """Whether a scenario has a custom part whose code has not run yet."""
-    return any(getattr(table, "waits", False) for _, table in _places(scenario))
+    return any(getattr(table, "is_unloaded", False) for _, table in _named_tables(scenario))
 
 
-def read(table: Any, name: str, code: object) -> Any:
+def load_table(table: Any, name: str, code: object) -> Any:
     """Return the table of a custom part with the keys of its class.
 
     Args:
@@ -154,69 +159,69 @@ def read(table: Any, name: str, code: object) -> Any:
         ScenarioError: there is no such class, or its fields cannot be keys.
     """
     try:
-        item = systems.item(code, f"{systems.WHERE} of a class") if isinstance(code, str) else code
+        item = systems.load_object(code, f"{systems.NAME_FORMS} of a class") if isinstance(code, str) else code
         base = table.base
         if not (isinstance(item, type) and issubclass(item, base)):
-            what = f"a class {item.__name__}" if isinstance(item, type) else f"of type {type(item).__name__}"
-            raise ValueError(f"it is {what}, but must be a class derived from ptsmc_jax.{base.__name__}")
-        return _with_keys(table, item, (_remade, table.remake, name, code))
+            shown_type = f"a class {item.__name__}" if isinstance(item, type) else f"of type {type(item).__name__}"
+            raise ValueError(f"it is {shown_type}, but must be a class derived from ptsmc_jax.{base.__name__}")
+        return _add_class_keys(table, item, (_reload_table, table.pickle_arguments, name, code))
     except ValueError as error:
         shown = brief(code) if isinstance(code, str) else getattr(code, "__name__", type(code).__name__)
         raise ScenarioError(f"{name}.code is {shown}: {error}") from None
 
 
-def _remade(remake: tuple, name: str, code: object) -> Any:
-    make, *arguments = remake
-    return read(make(*arguments), name, code)
+def _reload_table(remake: tuple, name: str, code: object) -> Any:
+    make_table, *arguments = remake
+    return load_table(make_table(*arguments), name, code)
 
 
 @functools.lru_cache(maxsize=256)
-def _with_keys(table: Any, found: Any, remake: tuple) -> Any:
+def _add_class_keys(table: Any, custom_class: Any, remake: tuple) -> Any:
     base = table.base
-    if all(getattr(found, method, None) is getattr(base, method, None) for method in table.needs):
-        raise ValueError(f"the class {found.__name__} has no method {' or '.join(table.needs)}")
-    common = {field.name: field for field in dataclasses.fields(base)}
-    for name in _annotated(found, base):
-        known = getattr(base, name, None)
-        if name in common.keys() - {DECLARED} or callable(known) or isinstance(known, property):
-            raise _name_in_use(found, name, "another name")
+    if all(getattr(custom_class, method, None) is getattr(base, method, None) for method in table.required_methods):
+        raise ValueError(f"the class {custom_class.__name__} has no method {' or '.join(table.required_methods)}")
+    base_fields = {field.name: field for field in dataclasses.fields(base)}
+    for name in _annotated_names(custom_class, base):
+        existing = getattr(base, name, None)
+        if name in base_fields.keys() - {REDECLARABLE_FIELD} or callable(existing) or isinstance(existing, property):
+            raise _name_in_use_error(custom_class, name, "another name")
         if hasattr(base, name):
-            raise _name_in_use(found, name, f"{name} = .. without a type")
-    for cls in reversed(found.__mro__):  # custom base classes have fields too
+            raise _name_in_use_error(custom_class, name, f"{name} = .. without a type")
+    for cls in reversed(custom_class.__mro__):  # custom base classes have fields too
         if issubclass(cls, base) and "__dataclass_fields__" not in cls.__dict__:
             try:
                 dataclasses.dataclass(frozen=True)(cls)
-            except TypeError as error:  # such as a field without a default
+            except TypeError as error:  # for example a field without a default
                 raise ValueError(f"the class {cls.__name__} cannot have such fields: {error}") from None
-    declared = {}
-    for field in dataclasses.fields(found):
-        if common.get(field.name) is not None and common[field.name].default is field.default:
+    declarations = {}
+    for field in dataclasses.fields(custom_class):
+        if base_fields.get(field.name) is not None and base_fields[field.name].default is field.default:
             continue
-        if (hasattr(table, field.name) or field.name == "rest") and field.name not in common:  # the name is in use
-            raise _name_in_use(found, field.name, "another name")
+        if (hasattr(table, field.name) or field.name == "rest") and field.name not in base_fields:  # the name is in use
+            raise _name_in_use_error(custom_class, field.name, "another name")
         if table.prefix + field.name == "observer_gain" or re.fullmatch(
             r"observer_gain_\d+", table.prefix + field.name
         ):
             raise ValueError(
                 f"its field {field.name} needs another name: gain_1, gain_2 .. are the numbers of gain for each axis"
             )
-        declared[field.name] = _declaration(table, found, field)
-    return schema.extended(table, found, "custom", declared, remake=remake)
+        declarations[field.name] = _declaration(table, custom_class, field)
+    return schema.extend_table(table, custom_class, "custom", declarations, pickle_arguments=remake)
 
 
-def _annotated(found: type, base: type) -> Iterator[str]:
+def _annotated_names(custom_class: type, base: type) -> Iterator[str]:
     """Yield the annotated names of a custom class and its custom bases; annotations make them dataclass fields."""
-    for cls in found.__mro__:
+    for cls in custom_class.__mro__:
         if issubclass(cls, base) and cls is not base:
-            yield from (name for name, kind in inspect.get_annotations(cls).items() if "ClassVar" not in str(kind))
+            yield from (name for name, hint in inspect.get_annotations(cls).items() if "ClassVar" not in str(hint))
 
 
-def _name_in_use(found: type, name: str, allowed: str) -> ValueError:
-    taken = f"the class {found.__name__} has a field {name}, a name that the base class already uses"
-    return ValueError(f"{taken}; allowed is {allowed}")
+def _name_in_use_error(custom_class: type, name: str, allowed: str) -> ValueError:
+    beginning = f"the class {custom_class.__name__} has a field {name}, a name that the base class already uses"
+    return ValueError(f"{beginning}; allowed is {allowed}")
 
 
-def fastest(table: Any, name: str, part: Any) -> float:
+def fastest_rate(table: Any, name: str, part: Any) -> float:
     """Return the largest angular frequency that the method `fastest` of a table's class reports [rad/s].
 
     Args:
@@ -227,53 +232,54 @@ def fastest(table: Any, name: str, part: Any) -> float:
     Raises:
         ScenarioError: the method does not return a number of at least 0.
     """
-    returned = table.made.fastest(part)
+    returned = table.part_class.fastest(part)
     try:
         rate = float(returned)
     except (TypeError, ValueError):
         rate = math.nan
     if not rate >= 0.0:
-        other = "nothing" if returned is None else f"a {type(returned).__name__}"
-        shown = brief(returned) if isinstance(returned, int | float | str) else other
+        description = "nothing" if returned is None else f"a {type(returned).__name__}"
+        shown = brief(returned) if isinstance(returned, int | float | str) else description
         raise ScenarioError(
-            f"{name}.code is the class {table.made.__name__}, whose method fastest returns {shown}, but must return an "
-            "angular frequency of at least 0 rad/s"
+            f"{name}.code is the class {table.part_class.__name__}, whose method fastest returns {shown}, but must "
+            "return an angular frequency of at least 0 rad/s"
         )
     return rate
 
 
-def _declaration(table: Any, found: Any, field: dataclasses.Field) -> Declaration:
+def _declaration(table: Any, custom_class: Any, field: dataclasses.Field) -> Declaration:
     """Return the declaration of a field of a custom class. A plain number becomes a key without a unit.
 
     ValueError is raised if the default is not a number, not allowed, or not possible for a gain.
     """
-    value, missing = typing.cast(Any, field.default), dataclasses.MISSING
-    one = field.metadata.get("declared")
-    numbers = value if isinstance(value, tuple) and value and not (one and one.gain) else (value,)
-    if not all(map(_plain, numbers)):
-        shown = "none" if value is missing else show(value)
-        allowed = "a number, the first argument of gain" if one and one.gain else "one number or several numbers"
+    value, no_default = typing.cast(Any, field.default), dataclasses.MISSING
+    declared = field.metadata.get("declared")
+    numbers = value if isinstance(value, tuple) and value and not (declared and declared.gain) else (value,)
+    if not all(map(_is_number, numbers)):
+        shown = "none" if value is no_default else show(value)
+        is_gain = declared is not None and declared.gain
+        allowed = "a number, the first argument of gain" if is_gain else "one number or several numbers"
         raise ValueError(f"the default of {field.name} is {shown}, but must be {allowed}")
     value = tuple(map(float, value)) if isinstance(value, tuple) else float(value)
-    one = (one or Declaration(value, "", "", Limits()))._replace(default=value)
-    one = one._replace(meaning=" ".join(one.meaning.split()) or "declared by the custom class")
+    declared = (declared or Declaration(value, "", "", Limits()))._replace(default=value)
+    declared = declared._replace(meaning=" ".join(declared.meaning.split()) or "declared by the custom class")
     try:
-        msgspec.convert(value, one.type(table.body), strict=True)
+        msgspec.convert(value, declared.type(table.body), strict=True)
     except msgspec.ValidationError:
-        words = f"a number{one.limits.words()}"
-        raise ValueError(f"the default of {field.name} is {value:g}, but must be {words}") from None
-    if one.gain:
-        _check_gain(table, found, field.name, one)
-    return one
+        allowed = f"a number{declared.limits.words()}"
+        raise ValueError(f"the default of {field.name} is {value:g}, but must be {allowed}") from None
+    if declared.gain:
+        _check_gain(table, custom_class, field.name, declared)
+    return declared
 
 
-def _plain(value: object) -> typing.TypeGuard[float]:
+def _is_number(value: object) -> typing.TypeGuard[float]:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _check_gain(table: Any, found: Any, name: str, gain: Declaration) -> None:
-    """Raise ValueError if a field that is a gain cannot be one of such a table, or has no sensible bounds."""
-    if not table.tuned:
+def _check_gain(table: Any, custom_class: Any, name: str, gain: Declaration) -> None:
+    """Raise ValueError if this kind of table cannot have the gain, or if the gain has no valid usual bounds."""
+    if not table.has_gains:
         raise ValueError(
             f"its field {name} is a gain, but the tuner cannot change parts of this kind; allowed is a number"
         )
@@ -282,11 +288,11 @@ def _check_gain(table: Any, found: Any, name: str, gain: Declaration) -> None:
     usual: Any = gain.usual
     if usual is None:
         raise ValueError(
-            f"the gain {name} of the class {found.__name__} has no bounds; allowed is ptsmc_jax.gain(.., "
+            f"the gain {name} of the class {custom_class.__name__} has no bounds; allowed is ptsmc_jax.gain(.., "
             "usual=(lower, upper))"
         )
-    plain = isinstance(usual, tuple | list) and len(usual) == 2 and all(map(_plain, usual)) and usual[0] < usual[1]
-    if plain and not usual[0] <= gain.default <= usual[1]:
+    valid = isinstance(usual, tuple | list) and len(usual) == 2 and all(map(_is_number, usual)) and usual[0] < usual[1]
+    if valid and not usual[0] <= gain.default <= usual[1]:
         raise ValueError(
             f"the default of the gain {name} is {gain.default:g}, but must be a number from {usual[0]:g} to "
             f"{usual[1]:g}, its usual bounds"

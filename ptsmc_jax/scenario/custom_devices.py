@@ -18,10 +18,10 @@ class SensorTable(PartTable, frozen=True):
     prefix: ClassVar[str] = "sensors_"
 
     def build(self, model: Any, period: float) -> Any:
-        """Return the sensors for the rollout; model: the design model of the plant, period: of control [s]."""
-        made = self.part(model=model)
-        _check_count(made, "sensors", "draws", 0)
-        return custom_sensors.CustomSensors(made, vector(1.0))
+        """Return the sensors for the rollout; `model`: the design model of the plant, `period`: control period [s]."""
+        part = self.part(model=model)
+        _check_count(part, "sensors", "draws", 0)
+        return custom_sensors.CustomSensors(part, vector(1.0))
 
 
 class DrawTable(PartTable, frozen=True):
@@ -29,28 +29,28 @@ class DrawTable(PartTable, frozen=True):
 
     def build(self) -> Any:
         """Return the dispersion, an instance of `ptsmc_jax.Draw`."""
-        made = self.part()
-        _check_count(made, "dispersion.custom", "count", 1)
-        if made.drawn not in DISTRIBUTIONS:
-            raise _unfit(made, "dispersion.custom", "drawn", '"normal" or "uniform"')
-        return made
+        part = self.part()
+        _check_count(part, "dispersion.custom", "count", 1)
+        if part.drawn not in DISTRIBUTIONS:
+            raise _field_error(part, "dispersion.custom", "drawn", '"normal" or "uniform"')
+        return part
 
 
-def _check_count(made: Any, table: str, field: str, least: int) -> None:
-    """Raise ScenarioError if the number of random numbers that a class declares is not a whole number >= `least`."""
-    value = getattr(made, field)
-    if not isinstance(value, int) or isinstance(value, bool) or value < least:
-        raise _unfit(made, table, field, f"a whole number of at least {least}")
+def _check_count(part: Any, table: str, field: str, smallest: int) -> None:
+    """Raise ScenarioError if the number of random numbers that a class declares is not a whole number >= `smallest`."""
+    value = getattr(part, field)
+    if not isinstance(value, int) or isinstance(value, bool) or value < smallest:
+        raise _field_error(part, table, field, f"a whole number of at least {smallest}")
 
 
-def _unfit(made: Any, table: str, field: str, must: str) -> ScenarioError:
-    names = f"{table}.code is a class whose {field} is {show(getattr(made, field))}"
-    return ScenarioError(f"{names}, but must be {must}")
+def _field_error(part: Any, table: str, field: str, allowed: str) -> ScenarioError:
+    beginning = f"{table}.code is a class whose {field} is {show(getattr(part, field))}"
+    return ScenarioError(f"{beginning}, but must be {allowed}")
 
 
 SENSORS: Kinds = {  # those that are built in are keys of [hardware] and [filter]
     "custom": custom_kind(
-        SensorTable, custom_sensors.SampledSensor, ("see",), tuned=True,
+        SensorTable, custom_sensors.SampledSensor, ("see",), has_gains=True,
         summary="Custom sensors, a class derived from ptsmc_jax.SampledSensor; its fields are further keys. They "
         "replace the noise of [hardware] and the table [filter].",
     )

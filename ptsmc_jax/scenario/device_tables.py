@@ -20,19 +20,21 @@ from ptsmc_jax.devices.attitude_filter import attitude_filter
 from ptsmc_jax.devices.attitude_sensors import sample_times
 from ptsmc_jax.devices.reaction_wheels import wheels
 from ptsmc_jax.devices.sensors import PerfectSensors, Sensors, StateSensor
-from ptsmc_jax.devices.star_times import filter_between
+from ptsmc_jax.devices.star_times import filter_between_samples
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.scenario import errors
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
-from ptsmc_jax.scenario.schema import PartTable, table
+from ptsmc_jax.scenario.schema import PartTable, make_table
 from ptsmc_jax.scenario.values import Count, Kinds, Meaning, NotNegative, NotNegatives, Positive, Table, Three
 
-SAME = 1e-9  # relative tolerance for a whole number of periods
-EACH = "one for each axis, wheel or input"
+WHOLE_TOLERANCE = 1e-9  # relative tolerance for a whole number of periods
+ONE_FOR_EACH = "one for each axis, wheel or input"
 PositiveEach = Annotated[
-    tuple[Positive, ...], Meta(min_length=1, description=f"a list of numbers greater than 0, {EACH}")
+    tuple[Positive, ...], Meta(min_length=1, description=f"a list of numbers greater than 0, {ONE_FOR_EACH}")
 ]
-ThreeEach = Annotated[tuple[Three, ...], Meta(min_length=1, description=f"a list of rows of three numbers, {EACH}")]
+ThreeEach = Annotated[
+    tuple[Three, ...], Meta(min_length=1, description=f"a list of rows of three numbers, {ONE_FOR_EACH}")
+]
 
 
 class CommandFilterTable(PartTable, frozen=True):
@@ -42,13 +44,13 @@ class CommandFilterTable(PartTable, frozen=True):
 
     def dead_time(self) -> float:
         """Return the delay of the filter at low frequencies, the negative derivative of its phase [s]."""
-        return self.made.dead_time(self)
+        return self.part_class.dead_time(self)
 
 
 COMMAND_FILTERS: Kinds = {
-    "first_order": table(CommandFilterTable, command_filter.FirstOrder, "first_order"),
-    "second_order": table(CommandFilterTable, command_filter.SecondOrder, "second_order"),
-    "notch": table(CommandFilterTable, command_filter.Notch, "notch"),
+    "first_order": make_table(CommandFilterTable, command_filter.FirstOrder, "first_order"),
+    "second_order": make_table(CommandFilterTable, command_filter.SecondOrder, "second_order"),
+    "notch": make_table(CommandFilterTable, command_filter.Notch, "notch"),
 }
 
 
@@ -76,13 +78,13 @@ class Actuators(Table, frozen=True):
         PositiveEach | None,
         Meaning("ratio of the true torque of each axis, wheel or input to the torque that the computer knows"),
     ] = None
-    levels: ClassVar[Mapping[str, tuple[str, ...]]] = {}  # by dispersion key: the keys here that set the nominal value
-    noises: ClassVar[tuple[str, ...]] = ()  # keys of sensor errors
+    nominal_keys: ClassVar[Mapping[str, tuple[str, ...]]] = {}  # by dispersion key: the keys that set its nominal value
+    noise_keys: ClassVar[tuple[str, ...]] = ()  # keys of sensor errors
 
     @property
-    def noisy(self) -> bool:
-        """Whether any key of `noises` is given."""
-        return any(getattr(self, key) is not None for key in self.noises)
+    def has_sensor_noise(self) -> bool:
+        """Whether any key of `noise_keys` is given."""
+        return any(getattr(self, key) is not None for key in self.noise_keys)
 
     @property
     def delay_periods(self) -> int:
@@ -100,7 +102,7 @@ class Actuators(Table, frozen=True):
         for key in ("actuator_scale", "actuator_misalignment_deg"):
             value = getattr(self, key, None)
             if value is not None and len(value) != channels:
-                raise wrong(f"hardware.{key}", value, f"a list of {channels}, {EACH}")
+                raise wrong(f"hardware.{key}", value, f"a list of {channels}, {ONE_FOR_EACH}")
 
     def noise_of_error(self, scenario: Any) -> tuple[float, float]:
         """Return the noise of the error and of its rate [1/s], 1 sigma per axis and raw sample."""
@@ -115,7 +117,7 @@ class Actuators(Table, frozen=True):
         raise NotImplementedError
 
     def actuators(self, wheels: Any) -> Any:
-        """Return the actuators; wheels: the part of `devices.reaction_wheels`, or None."""
+        """Return the actuators; `wheels`: the part of `devices.reaction_wheels`, or None."""
         values = (self.torque_limit, self.torque_rate_limit, self.torque_lag, self.torque_step)
         limit, rate_limit, lag, step = (None if v is None else vector(v) for v in values)
         scale = None if self.actuator_scale is None else vector(self.actuator_scale)
@@ -170,28 +172,28 @@ class Hardware(Actuators, frozen=True):
     star_tracker_misalignment_deg: Annotated[
         Three | None, Meaning("rotation vector of the star tracker in the body that the computer does not know", "deg")
     ] = None
-    levels: ClassVar[Mapping[str, tuple[str, ...]]] = {
+    nominal_keys: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "attitude_noise": ("attitude_noise",),
         "rate_noise": ("rate_noise", "rate_noise_density"),
         "torque_limit": ("torque_limit",),
     }
-    noises: ClassVar[tuple[str, ...]] = (
+    noise_keys: ClassVar[tuple[str, ...]] = (
         "attitude_noise", "rate_noise", "rate_noise_density", "rate_bias", "rate_bias_walk"
     )  # fmt: skip
 
     def gyro_noise(self, period: float) -> float:
-        """Return the noise of the gyro, 1 sigma per sample [rad/s]; period: of control [s]."""
-        return self.rate_noise or formulas.per_sample(self.rate_noise_density or 0.0, period)
+        """Return the noise of the gyro, 1 sigma per sample [rad/s]; `period`: control period [s]."""
+        return self.rate_noise or formulas.noise_per_sample(self.rate_noise_density or 0.0, period)
 
     def interval(self, period: float) -> float:
-        """Return the time between two samples of the star tracker [s]; period: of control [s]."""
+        """Return the time between two samples of the star tracker [s]; `period`: control period [s]."""
         return period * (self.star_tracker_every or 1) if self.star_tracker_period is None else self.star_tracker_period
 
-    def periods_apart(self, period: float) -> int | None:
+    def periods_per_sample(self, period: float) -> int | None:
         """Return the number of control periods between two star tracker samples, None if it is not whole."""
         ratio = self.interval(period) / period
-        whole = ratio if math.isinf(ratio) else round(ratio)  # `checks` refuses an interval longer than the run
-        return int(whole) if abs(ratio - whole) < SAME * ratio else None
+        nearest = ratio if math.isinf(ratio) else round(ratio)  # `checks` refuses an interval longer than the run
+        return int(nearest) if abs(ratio - nearest) < WHOLE_TOLERANCE * ratio else None
 
     def check(self, scenario: Any) -> None:
         """Raise ScenarioError for two gyro noises, or for a slow star tracker without a filter."""
@@ -201,29 +203,29 @@ class Hardware(Actuators, frozen=True):
         tracker_period, every, period = self.star_tracker_period, self.star_tracker_every, scenario.loop.period
         if tracker_period is not None and every is not None:
             raise wrong("hardware.star_tracker_period", tracker_period, "absent if star_tracker_every is given")
-        if tracker_period is not None and tracker_period < period * (1.0 - SAME):
+        if tracker_period is not None and tracker_period < period * (1.0 - WHOLE_TOLERANCE):
             raise wrong("hardware.star_tracker_period", tracker_period, f"at least loop.period, {period}")
-        if self.periods_apart(period) != 1 and not scenario.estimator.on:
-            key, value, one = ("every", every, 1) if tracker_period is None else ("period", tracker_period, period)
-            allowed = f'{one}, or [filter] with kind = "steady_state"'
+        if self.periods_per_sample(period) != 1 and not scenario.estimator.on:
+            key, value, smallest = ("every", every, 1) if tracker_period is None else ("period", tracker_period, period)
+            allowed = f'{smallest}, or [filter] with kind = "steady_state"'
             reason = f", but without a filter the law needs a sample every period; allowed is {allowed}"
-            raise errors.refused(f"hardware.star_tracker_{key}", value, reason, allowed)
+            raise errors.value_error(f"hardware.star_tracker_{key}", value, reason, allowed)
         for key in ("gyro_scale", "star_tracker_misalignment_deg"):
-            if getattr(self, key) is not None and not scenario.measured:
+            if getattr(self, key) is not None and not scenario.uses_measurements:
                 raise ScenarioError(
                     f"hardware.{key} needs noise of the sensors: without it the law sees the true state"
                 )
 
     def actuators(self, wheels: Any) -> Any:
-        """Return the actuators; wheels: the part of `devices.reaction_wheels`, or None."""
-        made = super().actuators(wheels)
+        """Return the actuators; `wheels`: the part of `devices.reaction_wheels`, or None."""
+        actuators = super().actuators(wheels)
         if self.actuator_misalignment_deg is None:
-            return made
+            return actuators
         from scipy.spatial.transform import Rotation  # the import takes 0.15 s, and most scenarios do not need it
 
-        turns = Rotation.from_rotvec(np.deg2rad(self.actuator_misalignment_deg))
+        rotations = Rotation.from_rotvec(np.deg2rad(self.actuator_misalignment_deg))
         axes = np.eye(3) if wheels is None else np.asarray(wheels.axes)
-        return dataclasses.replace(made, directions=vector(turns.apply(axes.T).T))
+        return dataclasses.replace(actuators, directions=vector(rotations.apply(axes.T).T))
 
     def noise_of_error(self, scenario: Any) -> tuple[float, float]:
         """Return half of the star tracker noise [-] and half of the gyro noise [1/s].
@@ -235,35 +237,35 @@ class Hardware(Actuators, frozen=True):
 
     def sensors(self, scenario: Any) -> Any:
         """Return star tracker, gyro and filter."""
-        if not scenario.measured:
+        if not scenario.uses_measurements:
             return PerfectSensors()
-        period, walk, turn = scenario.loop.period, self.rate_bias_walk, self.star_tracker_misalignment_deg
+        period, bias_walk, misalignment = scenario.loop.period, self.rate_bias_walk, self.star_tracker_misalignment_deg
         return Sensors(
             vector(self.attitude_noise or 0.0),
             vector(self.gyro_noise(period)),
             None if self.rate_bias is None else vector(self.rate_bias),
-            None if walk is None else vector(formulas.per_sample(walk, period)),
+            None if bias_walk is None else vector(formulas.noise_per_sample(bias_walk, period)),
             scenario.estimator.build(scenario),
-            self.periods_apart(period) or 1,
+            self.periods_per_sample(period) or 1,
             own_times=self.star_times(period),
             rate_scale=None if self.gyro_scale is None else vector(self.gyro_scale),
-            misalignment=None if turn is None else vector(np.deg2rad(turn)),
+            misalignment=None if misalignment is None else vector(np.deg2rad(misalignment)),
         )
 
     def star_times(self, period: float) -> Any:
         """Return the sample times of the star tracker, None if its interval is a whole number of control periods."""
-        return sample_times(self.interval(period), 0.0, period) if self.periods_apart(period) is None else None
+        return sample_times(self.interval(period), 0.0, period) if self.periods_per_sample(period) is None else None
 
 
 class StateHardware(Actuators, frozen=True):
     """Actuators and measurement noise of the sampled loop. A device without a key is off."""
 
     state_noise: Annotated[NotNegatives | None, Meaning("1 sigma per sample, one number for each state")] = None
-    levels: ClassVar[Mapping[str, tuple[str, ...]]] = {
+    nominal_keys: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "state_noise": ("state_noise",),
         "torque_limit": ("torque_limit",),
     }
-    noises: ClassVar[tuple[str, ...]] = ("state_noise",)
+    noise_keys: ClassVar[tuple[str, ...]] = ("state_noise",)
 
     def check(self, scenario: Any) -> None:
         """Raise ScenarioError unless the noise has one number for each state."""
@@ -284,8 +286,8 @@ class StateHardware(Actuators, frozen=True):
         if scenario.order == 2 or noises is None:
             return super().noise_of_s(scenario)
         a, rate = getattr(law, "a", (1.0,)), getattr(law, "surface_rate", None) or 1.0 / law.t_f
-        weights = [one * rate ** (len(a) - i) for i, one in enumerate([*a, 1.0])]
-        return math.hypot(*(w * noise for w, noise in zip(weights, noises, strict=False)))
+        surface_weights = [weight * rate ** (len(a) - i) for i, weight in enumerate([*a, 1.0])]
+        return math.hypot(*(w * noise for w, noise in zip(surface_weights, noises, strict=False)))
 
     def sensors(self, scenario: Any) -> Any:
         """Return `sensors.StateSensor`, or `PerfectSensors` without noise."""
@@ -298,7 +300,7 @@ class FilterTable(PartTable, frozen=True):
     on: ClassVar[bool] = True
     prefix: ClassVar[str] = "filter_"
 
-    def passes(self, scenario: Any) -> float:
+    def immediate_noise_fraction(self, scenario: Any) -> float:
         """Return the fraction of a star tracker sample's noise that reaches the law at once."""
         return 1.0
 
@@ -306,7 +308,7 @@ class FilterTable(PartTable, frozen=True):
         """Raise ScenarioError if keys contradict each other or the scenario."""
 
     def build(self, scenario: Any) -> Any:
-        """Return the filter, a part of `devices`, or None if the law sees the samples themselves."""
+        """Return the filter, a part of `devices`, or None if the law uses the raw samples."""
 
 
 class NoFilter(FilterTable, frozen=True):
@@ -328,10 +330,10 @@ class SteadyStateFilter(FilterTable, frozen=True):
     usual: ClassVar[Mapping[str, str]] = {"bandwidth": "bandwidth"}
 
     @staticmethod
-    def _noisy(table: Hardware) -> bool:
+    def _has_both_noises(table: Hardware) -> bool:
         return bool(table.attitude_noise and (table.rate_noise or table.rate_noise_density))
 
-    def width(self, scenario: Any) -> float:
+    def resolved_bandwidth(self, scenario: Any) -> float:
         """Return the bandwidth [rad/s]. By default, star tracker and gyro noise have equal weight at it."""
         if self.bandwidth is not None:
             return self.bandwidth
@@ -339,31 +341,31 @@ class SteadyStateFilter(FilterTable, frozen=True):
         noises = table.attitude_noise or 0.0, table.gyro_noise(period)
         return formulas.best_bandwidth(*noises, period, table.interval(period))
 
-    def written(self, scenario: Any) -> Any:
+    def complete_for_file(self, scenario: Any) -> Any:
         """Return the table with the default bandwidth filled in if both noises are greater than 0."""
-        noisy = self._noisy(scenario.devices)
-        return msgspec.structs.replace(self, bandwidth=self.width(scenario)) if noisy else self
+        has_noises = self._has_both_noises(scenario.devices)
+        return msgspec.structs.replace(self, bandwidth=self.resolved_bandwidth(scenario)) if has_noises else self
 
-    def passes(self, scenario: Any) -> float:
+    def immediate_noise_fraction(self, scenario: Any) -> float:
         """Return the attitude gain of a correction, see `devices.attitude_filter.filter_gains`."""
-        return -math.expm1(-2.0 * self.width(scenario) * scenario.devices.interval(scenario.loop.period))
+        return -math.expm1(-2.0 * self.resolved_bandwidth(scenario) * scenario.devices.interval(scenario.loop.period))
 
     def check(self, scenario: Any) -> None:
         """Raise ScenarioError if the bandwidth is absent and a noise that determines its default is 0."""
-        if self.bandwidth is None and not self._noisy(scenario.devices):
+        if self.bandwidth is None and not self._has_both_noises(scenario.devices):
             raise ScenarioError(
                 "filter.bandwidth is absent, but must be given where attitude_noise or rate_noise of [hardware] is 0"
             )
 
     def build(self, scenario: Any) -> Any:
-        """Return a filter of `devices.attitude_filter`, or of `devices.star_times` if samples lie between periods."""
+        """Return a filter of `devices.attitude_filter`, or of `devices.star_times` with its own sample times."""
         table, period = scenario.devices, scenario.loop.period
         star, gyro, walk = table.attitude_noise or 0.0, table.gyro_noise(period), table.rate_bias_walk or 0.0
-        known = tuple(vector(v) for v in (self.width(scenario), star, gyro, walk, period))
-        every, times = table.periods_apart(period), table.star_times(period)
+        arguments = tuple(vector(v) for v in (self.resolved_bandwidth(scenario), star, gyro, walk, period))
+        periods, times = table.periods_per_sample(period), table.star_times(period)
         if times is None:
-            return attitude_filter(*known, every)
-        return filter_between(*known, times.interval, times.pattern)
+            return attitude_filter(*arguments, periods)
+        return filter_between_samples(*arguments, times.interval, times.pattern)
 
 
 class WheelLimits(Table, frozen=True):
@@ -384,7 +386,7 @@ class WheelLimits(Table, frozen=True):
         """Return the spin axis of each wheel in body axes (wheels, 3)."""
         raise NotImplementedError
 
-    def refused(self, error: ValueError) -> ScenarioError:
+    def axes_error(self, error: ValueError) -> ScenarioError:
         """Return the configuration error for spin axes that are not allowed."""
         raise NotImplementedError
 
@@ -394,7 +396,7 @@ class WheelLimits(Table, frozen=True):
         try:
             formulas.wheel_axes(axes)
         except ValueError as error:
-            raise self.refused(error) from None
+            raise self.axes_error(error) from None
         if self.momentum is not None and len(self.momentum) != len(axes):
             raise wrong("wheels.momentum", self.momentum, f"a list of {len(axes)} numbers, one for each wheel")
         limit = self.momentum_limit
@@ -419,10 +421,10 @@ class PyramidWheels(WheelLimits, frozen=True):
         """Return the spin axes of four wheels (4, 3), tilted toward +z."""
         return formulas.pyramid(np.deg2rad(self.cant_deg))
 
-    def refused(self, error: ValueError) -> ScenarioError:
+    def axes_error(self, error: ValueError) -> ScenarioError:
         """Return the error for a cant angle whose wheels do not span all directions."""
-        enough = "far enough from 0 and 90 degrees for the wheels to span all directions"
-        return wrong("wheels.cant_deg", self.cant_deg, enough)
+        allowed = "far enough from 0 and 90 degrees for the wheels to span all directions"
+        return wrong("wheels.cant_deg", self.cant_deg, allowed)
 
 
 class AxesWheels(WheelLimits, frozen=True):
@@ -442,7 +444,7 @@ class AxesWheels(WheelLimits, frozen=True):
         """Return `axes` as an array (wheels, 3)."""
         return np.asarray(self.axes)
 
-    def refused(self, error: ValueError) -> ScenarioError:
+    def axes_error(self, error: ValueError) -> ScenarioError:
         """Return the error for `axes`."""
         return ScenarioError(f"wheels.axes is {errors.brief(self.spin_axes().tolist())}: {error}")
 

@@ -29,26 +29,26 @@ class Numbers(Table, frozen=True):
 
     name: ClassVar[str] = "normal"  # name of the kind in scenario files
     distribution: ClassVar[str] = "normal"  # distribution of `dispersions.numbers.RandomNumbers`
-    width: ClassVar[str] = "std"  # the key that holds the spread; it is in degrees if its name ends with _deg
-    widest: ClassVar[float] = 4.6  # norm / spread that one vector of three in 10 000 exceeds
-    farthest: ClassVar[float] = 3.0  # largest deviation that bounds allow for / spread: three sigma
+    width_key: ClassVar[str] = "std"  # the key that holds the spread; it is in degrees if its name ends with _deg
+    norm_quantile: ClassVar[float] = 4.6  # norm / spread that 1 of 10 000 vectors (3,) exceeds
+    largest_deviation: ClassVar[float] = 3.0  # largest deviation / spread in bounds: three sigma
 
-    def of(self, count: int = 1) -> np.ndarray:
+    def widths(self, count: int = 1) -> np.ndarray:
         """Return the widths of `count` numbers (count,), converted to rad if the key is in degrees.
 
         A single width in the table applies to all numbers.
         """
-        width = np.ones(count) * getattr(self, self.width)
-        return np.deg2rad(width) if self.width.endswith("_deg") else width
+        width = np.ones(count) * getattr(self, self.width_key)
+        return np.deg2rad(width) if self.width_key.endswith("_deg") else width
 
     @property
-    def nothing(self) -> bool:
+    def is_zero(self) -> bool:
         """Whether the spread is zero."""
-        return not np.any(self.of())
+        return not np.any(self.widths())
 
     def build(self, parts: Any, count: int) -> Any:
         """Return `dispersions.numbers.RandomNumbers`, (count,)."""
-        return RandomNumbers(self.distribution, vector(self.of(count)))
+        return RandomNumbers(self.distribution, vector(self.widths(count)))
 
 
 class Uniform(Numbers, frozen=True):
@@ -56,9 +56,9 @@ class Uniform(Numbers, frozen=True):
 
     name: ClassVar[str] = "uniform"
     distribution: ClassVar[str] = "uniform"
-    width: ClassVar[str] = "half_width"
-    widest: ClassVar[float] = float(np.sqrt(3.0))
-    farthest: ClassVar[float] = 1.0
+    width_key: ClassVar[str] = "half_width"
+    norm_quantile: ClassVar[float] = float(np.sqrt(3.0))
+    largest_deviation: ClassVar[float] = 1.0
 
 
 class Relative(Numbers, frozen=True):
@@ -66,7 +66,7 @@ class Relative(Numbers, frozen=True):
 
     name: ClassVar[str] = "relative_normal"
     distribution: ClassVar[str] = "truncated_normal"
-    widest: ClassVar[float] = 3.0
+    norm_quantile: ClassVar[float] = 3.0
 
 
 class RelativeUniform(Uniform, frozen=True):
@@ -75,10 +75,10 @@ class RelativeUniform(Uniform, frozen=True):
     name: ClassVar[str] = "relative_uniform"
 
 
-def _numbers(
+def _numbers_kind(
     name: str,
     base: type[Numbers],
-    about: str,
+    summary: str,
     meaning: str,
     unit: str,
     default: Any,
@@ -89,57 +89,59 @@ def _numbers(
     """Return the table of a kind, which has the width of `base` as its only key.
 
     Args:
-        name: of the class.
+        name: name of the class.
         base: the distribution.
-        about: docstring of the class.
+        summary: docstring of the class.
         meaning: meaning of the width.
         unit: unit of the width.
         default: default of the width; a `Scaled` one follows the mission.
         type_: type of the width.
         deg: whether the width is in degrees; its name then ends with _deg.
     """
-    width, follows = base.width + ("_deg" if deg else ""), isinstance(default, Scaled)
-    key = (width, Annotated[type_ | None if follows else type_, Meaning(meaning, unit)], None if follows else default)
-    space = {"__doc__": about, "__module__": __name__, "width": width, "scaled": {width: default} if follows else {}}
+    width_key, is_scaled = base.width_key + ("_deg" if deg else ""), isinstance(default, Scaled)
+    type_ = type_ | None if is_scaled else type_
+    key = (width_key, Annotated[type_, Meaning(meaning, unit)], None if is_scaled else default)
+    scaled = {width_key: default} if is_scaled else {}
+    namespace = {"__doc__": summary, "__module__": __name__, "width_key": width_key, "scaled": scaled}
     kind = ("kind", Literal[base.name], base.name)
-    return msgspec.defstruct(name, [kind, key], bases=(base,), frozen=True, kw_only=True, namespace=space)
+    return msgspec.defstruct(name, [kind, key], bases=(base,), frozen=True, kw_only=True, namespace=namespace)
 
 
 _RATE, _BIAS = ("rad/s", Scaled(0.01, time=-1)), ("unit of d", Scaled(1e-3, inertia=1, order=-1))
-_BY_RATE, _BY_BIAS = "; default: 0.01, scaled to the mission", "; default: 1e-3, scaled to the mission"
-_ONE_EACH = ", one number for each state; default: 1 each"
+_RATE_TEXT, _BIAS_TEXT = "; default: 0.01, scaled to the mission", "; default: 1e-3, scaled to the mission"
+_EACH_STATE = ", one number for each state; default: 1 each"
 # each variable has the name of its class, so that pickle finds the class in this module
-NormalRate = _numbers(
-    "NormalRate", Numbers, "Each axis normal about initial.rate.", "1 sigma per axis" + _BY_RATE, *_RATE
+NormalRate = _numbers_kind(
+    "NormalRate", Numbers, "Each axis normal about initial.rate.", "1 sigma per axis" + _RATE_TEXT, *_RATE
 )
-UniformRate = _numbers(
-    "UniformRate", Uniform, "Each axis uniform about initial.rate.", "largest deviation per axis" + _BY_RATE, *_RATE
+UniformRate = _numbers_kind(
+    "UniformRate", Uniform, "Each axis uniform about initial.rate.", "largest deviation per axis" + _RATE_TEXT, *_RATE
 )
-NormalBias = _numbers(
-    "NormalBias", Numbers, "Normal about the value in [disturbance].", "1 sigma of each component" + _BY_BIAS, *_BIAS
+NormalBias = _numbers_kind(
+    "NormalBias", Numbers, "Normal about the value in [disturbance].", "1 sigma of each component" + _BIAS_TEXT, *_BIAS
 )
-UniformBias = _numbers(
+UniformBias = _numbers_kind(
     "UniformBias", Uniform, "Uniform about the value in [disturbance].",
-    "largest deviation of each component" + _BY_BIAS, *_BIAS,
+    "largest deviation of each component" + _BIAS_TEXT, *_BIAS,
 )  # fmt: skip
-UniformState = _numbers(
-    "UniformState", Uniform, "Every state uniform about x0.", "largest deviation" + _ONE_EACH, "", (), NotNegatives
+UniformState = _numbers_kind(
+    "UniformState", Uniform, "Every state uniform about x0.", "largest deviation" + _EACH_STATE, "", (), NotNegatives
 )
-NormalState = _numbers(
-    "NormalState", Numbers, "Every state normal about x0.", "1 sigma" + _ONE_EACH, "", (), NotNegatives
+NormalState = _numbers_kind(
+    "NormalState", Numbers, "Every state normal about x0.", "1 sigma" + _EACH_STATE, "", (), NotNegatives
 )
-NormalFactor = _numbers(
+NormalFactor = _numbers_kind(
     "NormalFactor", Relative, "The value times 1 + a normal number, truncated at three sigma.",
     "relative standard deviation", "", 0.1, SmallFraction,
 )  # fmt: skip
-UniformFactor = _numbers(
+UniformFactor = _numbers_kind(
     "UniformFactor", RelativeUniform, "The value times 1 + a uniform number.",
     "largest relative deviation", "", 0.2, BelowOne,
 )  # fmt: skip
-NormalTurn = _numbers(
+NormalTurn = _numbers_kind(
     "NormalTurn", Numbers, "Rotated by a normal rotation vector.", "1 sigma per component", "deg", 0.1, deg=True
 )
-UniformTurn = _numbers(
+UniformTurn = _numbers_kind(
     "UniformTurn", Uniform, "Rotated by a rotation vector with uniform components.", "largest size of a component",
     "deg", 0.1, deg=True,
 )  # fmt: skip
@@ -168,7 +170,7 @@ class AxisAngle(Table, frozen=True):
     max_deg: Annotated[Angle, Meaning("largest angle", "deg")] = 140.0
 
     def largest_angle(self, angle: float) -> float:
-        """Return the largest angle [rad] to the reference; angle: of the nominal attitude [rad]."""
+        """Return the largest angle [rad] to the reference; `angle`: nominal angle [rad]."""
         return float(np.deg2rad(self.max_deg))
 
     def build(self, parts: Any, count: int) -> Any:
@@ -183,7 +185,7 @@ class NormalAttitude(Table, frozen=True):
     std_deg: Annotated[NotNegative, Meaning("1 sigma per axis", "deg")] = 1.0
 
     def largest_angle(self, angle: float) -> float:
-        """Return the angle to the reference [rad] that one random attitude in 10 000 exceeds; angle: nominal [rad]."""
+        """Return the angle to the reference [rad] that one random attitude in 10 000 exceeds; `angle`: nominal."""
         return min(angle + 4.6 * float(np.deg2rad(self.std_deg)), np.pi)
 
     def build(self, parts: Any, count: int) -> Any:
@@ -194,7 +196,7 @@ class NormalAttitude(Table, frozen=True):
 class RelativeInertia(Table, frozen=True):
     """Normal relative errors of the true principal moments, truncated at three sigma and to moments of a real body."""
 
-    farthest: ClassVar[float] = 3.0  # largest deviation of a moment / std
+    largest_deviation: ClassVar[float] = 3.0  # largest deviation of a moment / std
     kind: Literal["relative_normal"] = "relative_normal"
     std: Annotated[SmallFraction, Meaning("relative standard deviation")] = 0.05
     axes_deg: Annotated[NotNegative, Meaning("1 sigma of the small rotation of the principal axes", "deg")] = 0.0
@@ -310,7 +312,7 @@ _DISTURBANCE: dict[str, tuple[str, tuple[Any, ...]]] = {
     "disturbance_amplitude": ("independent factor on each component of each sinusoid and constant", FACTORS),
     "disturbance_bias": ("an additional constant disturbance", (NormalBias, UniformBias)),
 }
-_ANY: dict[str, tuple[str, tuple[Any, ...]]] = {
+_ANY_PLANT: dict[str, tuple[str, tuple[Any, ...]]] = {
     "torque_limit": ("factor on hardware.torque_limit", FACTORS),
     "timing_jitter": (
         "timing error of the samples as a fraction of loop.period; the flight software does not know it", (Jitter,),
@@ -336,25 +338,25 @@ _SPACECRAFT: dict[str, tuple[str, tuple[Any, ...]]] = {
     "wheel_failure": ("failure of one wheel: it has no torque from a random time on", (Failure,)),
     "mode_frequency": ("factor on each of flexible.frequency", FACTORS),
     "mode_coupling": ("factor on each row of flexible.coupling", FACTORS),
-    **_ANY,
+    **_ANY_PLANT,
 }
 _STATE = {
     "x0": ("initial state", (UniformState, NormalState)),
     **_DISTURBANCE,
     "state_noise": ("factor on hardware.state_noise", FACTORS),
     "actuator_scale": ("factor on each input that the computer does not know", FACTORS),
-    **_ANY,
+    **_ANY_PLANT,
 }
 
 
-def _dispersion(name: str, rows: Mapping[str, tuple[str, tuple[Any, ...]]]) -> Any:
-    about = "Random quantities of each trial, each an inline table with a kind; the others stay nominal."
+def _dispersion_table(name: str, rows: Mapping[str, tuple[str, tuple[Any, ...]]]) -> Any:
+    summary = "Random quantities of each trial, each an inline table with a kind; the others stay nominal."
     keys = [(key, Annotated[Table | None, Meaning(meaning)], None) for key, (meaning, _) in rows.items()]
-    space = {"__doc__": about, "__module__": __name__}
-    return msgspec.defstruct(name, keys, bases=(Table,), frozen=True, kw_only=True, namespace=space)
+    namespace = {"__doc__": summary, "__module__": __name__}
+    return msgspec.defstruct(name, keys, bases=(Table,), frozen=True, kw_only=True, namespace=namespace)
 
 
-Dispersion, StateDispersion = _dispersion("Dispersion", _SPACECRAFT), _dispersion("StateDispersion", _STATE)
+Dispersion, StateDispersion = _dispersion_table("Dispersion", _SPACECRAFT), _dispersion_table("StateDispersion", _STATE)
 DISPERSIONS: dict[str, Kinds] = {
     key: {typing.get_args(typing.get_type_hints(one)["kind"])[0]: one for one in kinds}
     for key, (_, kinds) in {**_SPACECRAFT, **_STATE}.items()

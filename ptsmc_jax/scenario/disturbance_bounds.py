@@ -20,11 +20,11 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.values import MOST_STEPS
 from ptsmc_jax.signals import disturbances
 
-RATE = 10.0 / 12.0  # l / J of the published observer [1/s], with a mean moment of inertia of 12 kg m^2
+PUBLISHED_RATE = 10.0 / 12.0  # l / J of the published observer [1/s], with a mean moment of inertia of 12 kg m^2
 SIGMAS = 3.0  # standard deviations that count as the largest value of a normal random number
-POINTS = 2001  # smallest number of times at which a custom disturbance is evaluated
-FINE = 0.1  # largest phase between two of these times [rad]: the error of the derivative is then 0.2 %
-PHASES = 16  # random phases at which a custom disturbance is evaluated
+FEWEST_TIMES = 2001  # smallest number of times at which a custom disturbance is evaluated
+LARGEST_PHASE_STEP = 0.1  # largest phase between two of these times [rad]: the error of the derivative is then 0.2 %
+PHASE_COUNT = 16  # random phases at which a custom disturbance is evaluated
 
 
 class Bounds(NamedTuple):
@@ -44,26 +44,26 @@ def compute(scenario: Any) -> tuple[float, float] | None:
     """
     inputs = scenario.inputs
     with np.errstate(over="ignore"):
-        found = [term.bounds(scenario) for term in scenario.terms]
-        known = [one for one in found if one is not None]
-        if len(known) < len(found):
+        bounds = [term.bounds(scenario) for term in scenario.terms]
+        known = [term_bounds for term_bounds in bounds if term_bounds is not None]
+        if len(known) < len(bounds):
             return None
-        largest = sum((one.size for one in known), np.zeros(inputs)) + _drawn_bias(scenario)
-        fastest = sum((one.rate for one in known), np.zeros(inputs))
+        largest = sum((term_bounds.size for term_bounds in known), np.zeros(inputs)) + _largest_bias(scenario)
+        fastest = sum((term_bounds.rate for term_bounds in known), np.zeros(inputs))
     if not np.all(np.isfinite([largest, fastest])):
         raise ScenarioError("disturbance has an infinite amplitude or rate; allowed are smaller numbers in the table")
     return float(np.max(largest)), float(np.max(fastest))
 
 
-def drawn_factor(scenario: Any) -> float:
+def largest_factor(scenario: Any) -> float:
     """Return the largest random factor on the disturbance's amplitude."""
-    drawn = getattr(scenario.dispersion, "disturbance_amplitude", None)
-    return 1.0 if drawn is None else 1.0 + drawn.farthest * getattr(drawn, drawn.width)
+    amplitude = getattr(scenario.dispersion, "disturbance_amplitude", None)
+    return 1.0 if amplitude is None else 1.0 + amplitude.largest_deviation * getattr(amplitude, amplitude.width_key)
 
 
-def _drawn_bias(scenario: Any) -> float:
-    drawn = getattr(scenario.dispersion, "disturbance_bias", None)
-    return 0.0 if drawn is None else drawn.farthest * getattr(drawn, drawn.width)
+def _largest_bias(scenario: Any) -> float:
+    bias = getattr(scenario.dispersion, "disturbance_bias", None)
+    return 0.0 if bias is None else bias.largest_deviation * getattr(bias, bias.width_key)
 
 
 def walk_rate(scenario: Any, density: np.ndarray) -> np.ndarray:
@@ -76,8 +76,8 @@ def walk_rate(scenario: Any, density: np.ndarray) -> np.ndarray:
         scenario: the scenario, for the observer's time constant.
         density: density of the walk (m,) [unit of d/sqrt(s)].
     """
-    forgets = 1.0 / observer_rate(scenario)
-    return SIGMAS * density / math.sqrt(forgets)
+    time_constant = 1.0 / observer_rate(scenario)
+    return SIGMAS * density / math.sqrt(time_constant)
 
 
 def observer_rate(scenario: Any) -> float:
@@ -85,7 +85,9 @@ def observer_rate(scenario: Any) -> float:
 
     For a plant without a body the published rate is 10 1/s.
     """
-    rate = mission.scales(scenario).of(Scaled(10.0 if scenario.moments[0] is None else RATE, time=-1))
+    rate = mission.scales(scenario).scaled_value(
+        Scaled(10.0 if scenario.moments[0] is None else PUBLISHED_RATE, time=-1)
+    )
     return min(rate, 1.0 / scenario.loop.period) if scenario.sampled else rate
 
 
@@ -103,13 +105,13 @@ def body_rate_bound(scenario: Any) -> float:
     It is the sum of the initial rate, the rate of the reference, and 2 pi / t_f, which is twice the mean rate of half a
     turn within t_f.
     """
-    target = sum(scenario.reference.frequencies(scenario).values())
-    return scenario.initial_rate_bound + target + 2.0 * math.pi / scenario.controller.t_f
+    reference_rate = sum(scenario.reference.frequencies(scenario).values())
+    return scenario.initial_rate_bound + reference_rate + 2.0 * math.pi / scenario.controller.t_f
 
 
-def target_waits(scenario: Any) -> bool:
+def has_unloaded_reference(scenario: Any) -> bool:
     """Whether the reference is custom code that has not run yet, so that its rate is unknown."""
-    return getattr(getattr(scenario, "reference", None), "waits", False)
+    return getattr(getattr(scenario, "reference", None), "is_unloaded", False)
 
 
 def gravity_gradient(scenario: Any, orbit_rate: float, eccentricity: float = 0.0) -> Bounds:
@@ -129,85 +131,89 @@ def gravity_gradient(scenario: Any, orbit_rate: float, eccentricity: float = 0.0
     """
     inertia = np.asarray(scenario.true_inertia, dtype=float)
     moments = np.sort(inertia) if inertia.ndim == 1 else np.linalg.eigvalsh(inertia)
-    drawn = getattr(scenario.dispersion, "inertia", None)
-    off = 0.0 if drawn is None else SIGMAS * drawn.std
-    apart = moments[2] * (1.0 + off) - moments[0] * (1.0 - off)
+    inertia_dispersion = getattr(scenario.dispersion, "inertia", None)
+    deviation = 0.0 if inertia_dispersion is None else SIGMAS * inertia_dispersion.std
+    moment_difference = moments[2] * (1.0 + deviation) - moments[0] * (1.0 - deviation)
     e = eccentricity
-    most = 3.0 * orbit_rate * orbit_rate * apart / (1.0 - e) ** 3
+    factor = 3.0 * orbit_rate * orbit_rate * moment_difference / (1.0 - e) ** 3
     perigee_rate = orbit_rate * math.sqrt(1.0 + e) / (1.0 - e) ** 1.5
     return Bounds(
-        np.full(3, 0.5 * most), np.full(3, most * ((1.0 + 1.5 * e) * perigee_rate + body_rate_bound(scenario)))
+        np.full(3, 0.5 * factor), np.full(3, factor * ((1.0 + 1.5 * e) * perigee_rate + body_rate_bound(scenario)))
     )
 
 
-def along_the_run(scenario: Any, signal: Any, fastest: float = 0.0) -> Bounds:
+def path_bounds(scenario: Any, signal: Any, fastest: float = 0.0) -> Bounds:
     """Return the largest size and rate of a custom disturbance d(t, x) on the nominal path to the target.
 
     On that path the error falls like (t_f - t)^3 until t_f, then the state follows the target. Amplitudes and phases
-    that the dispersions can draw are included, see `_as_drawn`. The bounds of a disturbance that fails, or is not
-    finite at t = 0, are zero: `custom_checks` refuses it before a run.
+    of the dispersions are included, see `_extreme_disturbances`. The bounds of a disturbance that fails, or is not
+    finite at t = 0, are zero: `custom_checks` reports it before a run.
 
     Args:
         scenario: a scenario whose reference is known.
         signal: the disturbance, a function of t [s] and the plant's state.
-        fastest: how fast the disturbance changes [rad/s].
+        fastest: largest angular frequency of the disturbance [rad/s].
 
     Raises:
         ScenarioError: the disturbance is finite at t = 0 and not finite later on the path.
     """
     from ptsmc_jax.batching import lapack  # the import takes 0.1 s, and most scenarios do not need it
 
-    needed = min(float(scenario.loop.t_end) * fastest / FINE, MOST_STEPS)
-    t = np.linspace(0.0, float(scenario.loop.t_end), max(POINTS, math.ceil(needed) + 1))
-    left = np.clip(1.0 - t / scenario.controller.t_f, 0.0, 1.0) ** 3
-    states = left[:, None] * scenario.plant.x0 if scenario.moments[0] is None else _attitudes(scenario, t, left)
+    steps = min(float(scenario.loop.t_end) * fastest / LARGEST_PHASE_STEP, MOST_STEPS)
+    t = np.linspace(0.0, float(scenario.loop.t_end), max(FEWEST_TIMES, math.ceil(steps) + 1))
+    remaining = np.clip(1.0 - t / scenario.controller.t_f, 0.0, 1.0) ** 3
+    states = (
+        remaining[:, None] * scenario.plant.x0 if scenario.moments[0] is None else _body_states(scenario, t, remaining)
+    )
     largest = np.zeros((2, scenario.inputs))
-    for drawn in _as_drawn(scenario, signal):
+    for disturbance in _extreme_disturbances(scenario, signal):
         try:
-            acting = np.asarray(lapack.vmap(drawn)(jnp.asarray(t), jax.tree.map(jnp.asarray, states)))
+            values = np.asarray(lapack.vmap(disturbance)(jnp.asarray(t), jax.tree.map(jnp.asarray, states)))
         except Exception:  # `custom_checks` reports it before a run
-            acting = np.zeros(0)
-        bad = np.flatnonzero(~np.isfinite(acting).all(axis=1)) if acting.shape == (t.size, scenario.inputs) else [0]
-        if len(bad) and bad[0] == 0:
+            values = np.zeros(0)
+        invalid = np.flatnonzero(~np.isfinite(values).all(axis=1)) if values.shape == (t.size, scenario.inputs) else [0]
+        if len(invalid) and invalid[0] == 0:
             return Bounds(*np.zeros_like(largest))
-        if len(bad):
+        if len(invalid):
             raise ScenarioError(
                 f"disturbance.code names a class {type(signal).__name__} whose __call__ returns "
-                f"{acting[bad[0]].tolist()} at t = {t[bad[0]]:.6g} s on the way to the target, but must return finite "
-                "numbers"
+                f"{values[invalid[0]].tolist()} at t = {t[invalid[0]]:.6g} s on the way to the target, but must return "
+                "finite numbers"
             )
-        sizes = (np.max(np.abs(d), axis=0) for d in (acting, np.gradient(acting, t, axis=0)))
+        sizes = (np.max(np.abs(samples), axis=0) for samples in (values, np.gradient(values, t, axis=0)))
         largest = np.maximum(largest, [*sizes])
     return Bounds(*largest)
 
 
-def _as_drawn(scenario: Any, signal: Any) -> list[Any]:
-    """Return a custom disturbance with the smallest and the largest random amplitudes, at `PHASES` phases."""
-    found, most = [signal], drawn_factor(scenario)
-    if most != 1.0 and disturbances.count(signal, "amplitude"):
+def _extreme_disturbances(scenario: Any, signal: Any) -> list[Any]:
+    """Return a custom disturbance with the smallest and the largest random amplitudes, at `PHASE_COUNT` phases."""
+    extremes, largest = [signal], largest_factor(scenario)
+    if largest != 1.0 and disturbances.count_values(signal, "amplitude"):
         amplitudes = disturbances.values(signal, "amplitude")
-        found = [disturbances.with_values(signal, "amplitude", amplitudes * k) for k in (most, 2.0 - most)]
-    if getattr(scenario.dispersion, "disturbance_phase", None) is None or not disturbances.count(signal, "phase"):
-        return found
-    around, phases = np.linspace(0.0, 2.0 * np.pi, PHASES, endpoint=False), disturbances.values(signal, "phase")
-    return [disturbances.with_values(one, "phase", phases + angle) for one in found for angle in around]
+        extremes = [disturbances.with_values(signal, "amplitude", amplitudes * k) for k in (largest, 2.0 - largest)]
+    if getattr(scenario.dispersion, "disturbance_phase", None) is None or not disturbances.count_values(
+        signal, "phase"
+    ):
+        return extremes
+    angles, phases = np.linspace(0.0, 2.0 * np.pi, PHASE_COUNT, endpoint=False), disturbances.values(signal, "phase")
+    return [disturbances.with_values(one, "phase", phases + angle) for one in extremes for angle in angles]
 
 
-def _attitudes(scenario: Any, t: np.ndarray, left: np.ndarray) -> Any:
+def _body_states(scenario: Any, t: np.ndarray, remaining: np.ndarray) -> Any:
     """Return the states of the body on the nominal path at times t (n,) [s].
 
-    `left` (n,) is the remaining fraction of the initial rotation from the reference.
+    `remaining` (n,) is the remaining fraction of the initial rotation from the reference.
     """
     from ptsmc_jax.batching import lapack
 
     reference = scenario.reference.build(scenario)
     target = lapack.vmap(lambda time: reference(time).q)(jnp.asarray(t))
     start = jnp.asarray(attitude_keys.quaternion(scenario.initial, "initial"))
-    off = attitude.multiply(attitude.conjugate(target[0]), start)
-    off = off * jnp.where(off[3] < 0.0, -1.0, 1.0)
-    turned = attitude.rotation_vector(off[:3])
-    q = jax.vmap(lambda one, fraction: attitude.multiply(one, attitude.from_rotation_vector(fraction * turned)))(
-        target, jnp.asarray(left)
+    rotation = attitude.multiply(attitude.conjugate(target[0]), start)
+    rotation = rotation * jnp.where(rotation[3] < 0.0, -1.0, 1.0)
+    turn = attitude.rotation_vector(rotation[:3])
+    q = jax.vmap(lambda one, fraction: attitude.multiply(one, attitude.from_rotation_vector(fraction * turn)))(
+        target, jnp.asarray(remaining)
     )
     q_dot = jnp.asarray(np.gradient(np.asarray(q), t, axis=0))
     w = 2.0 * jax.vmap(lambda one, rate: attitude.multiply(attitude.conjugate(one), rate)[:3])(q, q_dot)

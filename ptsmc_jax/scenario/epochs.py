@@ -8,7 +8,7 @@ from ptsmc_jax.scenario.errors import wrong
 
 J2000 = dt.datetime(2000, 1, 1, 12)
 ALLOWED = 'a time such as "2026-03-20T12:00:00.5" or "2026-079T12:00:00.5"'
-_TEXT = re.compile(r"(\d{4})-(\d{2}-\d{2}|\d{3})T(\d{2}):(\d{2}):(\d{2})(\.\d+)?Z?")
+_ISO_TIME = re.compile(r"(\d{4})-(\d{2}-\d{2}|\d{3})T(\d{2}):(\d{2}):(\d{2})(\.\d+)?Z?")
 
 
 class Epoch(NamedTuple):
@@ -44,22 +44,22 @@ def parse(text: str) -> Epoch:
     Raises:
         ValueError: it is no such text. Leap seconds are not allowed. The message continues the text.
     """
-    found = _TEXT.fullmatch(text.strip())
+    match = _ISO_TIME.fullmatch(text.strip())
     try:
-        if found is None:
+        if match is None:
             raise ValueError
-        year, day, hour, minute, second, fraction = found.groups()
-        form = "%Y-%m-%d" if "-" in day else "%Y-%j"
-        start = dt.datetime.strptime(f"{year}-{day}", form)
-        whole = start + dt.timedelta(hours=int(hour), minutes=int(minute), seconds=int(second))
+        year, day, hour, minute, second, fraction = match.groups()
+        date_format = "%Y-%m-%d" if "-" in day else "%Y-%j"
+        start = dt.datetime.strptime(f"{year}-{day}", date_format)
+        time = start + dt.timedelta(hours=int(hour), minutes=int(minute), seconds=int(second))
         if int(hour) > 23 or int(minute) > 59 or int(second) > 59:
             raise ValueError
     except ValueError:
         raise ValueError(f"but must be {ALLOWED}, without leap seconds") from None
-    return Epoch(int((whole - J2000).total_seconds()), float(fraction or 0.0))
+    return Epoch(int((time - J2000).total_seconds()), float(fraction or 0.0))
 
 
-def of_key(text: str) -> Epoch:
+def parse_key(text: str) -> Epoch:
     """Return the epoch of the key `loop.epoch`; raise ScenarioError if it is not valid."""
     try:
         return parse(text)

@@ -26,7 +26,7 @@ class ScenarioError(ValueError):
         super().__init__(text)
         self.key, self.value, self.reason, self.allowed = key, value, reason, allowed
 
-    def quoting(self, value: str) -> "ScenarioError":
+    def with_shown_value(self, value: str) -> "ScenarioError":
         """Return the error with this text instead of the value."""
         text = f"{self.key} is {value}{self.reason}"
         return ScenarioError(text, key=self.key, value=self.value, reason=self.reason, allowed=self.allowed)
@@ -44,10 +44,10 @@ def wrong(key: str, value: Any, allowed: str) -> ScenarioError:
         value: its value.
         allowed: the allowed values, in words.
     """
-    return refused(key, value, f", but must be {allowed}", allowed)
+    return value_error(key, value, f", but must be {allowed}", allowed)
 
 
-def refused(key: str, value: Any, reason: str, allowed: str = "") -> ScenarioError:
+def value_error(key: str, value: Any, reason: str, allowed: str = "") -> ScenarioError:
     """Return the error for the value of a key.
 
     Args:
@@ -57,7 +57,7 @@ def refused(key: str, value: Any, reason: str, allowed: str = "") -> ScenarioErr
         allowed: the allowed values, in words; empty if the reason does not end with them.
     """
     error = ScenarioError("", key=key, value=value, reason=reason, allowed=allowed)
-    return error.quoting(brief(value))
+    return error.with_shown_value(brief(value))
 
 
 def brief(value: Any) -> str:

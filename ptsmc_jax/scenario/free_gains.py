@@ -10,11 +10,11 @@ import msgspec
 
 from ptsmc_jax.scenario import errors, gain_bounds, parsing, tables
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
-from ptsmc_jax.scenario.gain_bounds import Choice, wide
+from ptsmc_jax.scenario.gain_bounds import BoundsContext, is_log_scaled
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
 
-FIRST = ("t_f", "p", "surface_rate")  # gains whose bounds determine the bounds of other gains
+RESOLVED_FIRST = ("t_f", "p", "surface_rate")  # gains whose bounds determine the bounds of other gains
 
 
 def resolve(scenario: Scenario, tune: tables.Tune) -> tables.Tune:
@@ -30,23 +30,23 @@ def resolve(scenario: Scenario, tune: tables.Tune) -> tables.Tune:
     free = tune.free
     if free is None:
         law = scenario.controller
-        first, rest = law.free(sampled=scenario.sampled)
-        others = [name for name in scenario.gains if name not in (*law.gains, *scenario.observer.gains)]
-        free = (*first, *scenario.observer.gains, *rest, *others)
+        before_observer, after_observer = law.free(sampled=scenario.sampled)
+        other_gains = [name for name in scenario.gains if name not in (*law.gains, *scenario.observer.gains)]
+        free = (*before_observer, *scenario.observer.gains, *after_observer, *other_gains)
     level = 0.9 if tune.statistic in tables.LEVELS and tune.level is None else tune.level
     tune = msgspec.structs.replace(tune, free=free, level=level)
-    _check(scenario, tune)
+    _check_table(scenario, tune)
     bounds = dict(tune.bounds)
-    for key in sorted(free, key=lambda name: name not in FIRST):
+    for key in sorted(free, key=lambda name: name not in RESOLVED_FIRST):
         if key not in bounds:
-            bounds[key] = _default(Choice(scenario, free, bounds), key)
+            bounds[key] = _default_bounds(BoundsContext(scenario, free, bounds), key)
     tune = msgspec.structs.replace(tune, bounds={key: bounds[key] for key in free})
     for name in free:
-        _check_bounds(Choice(scenario, free, bounds), name)
+        _check_bounds(BoundsContext(scenario, free, bounds), name)
     return tune
 
 
-def need_some(scenario: Scenario) -> None:
+def require_free_gains(scenario: Scenario) -> None:
     """Raise ScenarioError if a scenario with [tune] has no free gain, which is possible with a custom law."""
     if not scenario.search.gains:
         raise ScenarioError(
@@ -56,110 +56,112 @@ def need_some(scenario: Scenario) -> None:
         )
 
 
-def observer_follows(scenario: Scenario) -> bool:
+def is_observer_time_default(scenario: Scenario) -> bool:
     """Whether the observer's t_o is absent, so that it is a fraction of t_f."""
     return getattr(scenario.observer, "t_o", 0.0) is None
 
 
-def _check(scenario: Scenario, tune: tables.Tune) -> None:
+def _check_table(scenario: Scenario, tune: tables.Tune) -> None:
     """Raise ScenarioError for invalid gains, objective or bounds, before default bounds are computed."""
     free, present = tune.gains, scenario.gains
     if len(set(free)) < len(free):
         raise wrong("tune.free", free, "a list that names each gain once")
-    if not set(free) <= {*tables.FREE, *present}:
+    if not set(free) <= {*tables.TUNABLE_GAINS, *present}:
         raise wrong("tune.free", free, tables.FREE_ALLOWED)
     beginning = f"tune.free is {errors.brief(free)}, but"
     for name in free:
         if name not in present:
-            raise ScenarioError(f"{beginning} {_absent(scenario, name)}")
-    if "t_f" in free and observer_follows(scenario):
+            raise ScenarioError(f"{beginning} {_absence_reason(scenario, name)}")
+    if "t_f" in free and is_observer_time_default(scenario):
         raise ScenarioError(f"{beginning} observer.t_o then follows t_f; allowed is t_f with observer.t_o given")
     if tune.per_axis and "observer_gain" not in free:
         raise ScenarioError(f"tune.per_axis is true, but tune.free is {errors.brief(free)}, without observer_gain")
     _check_objective(scenario, tune, beginning)
     for name in tune.bounds:
-        _check_bounds(Choice(scenario, free, tune.bounds), name)
+        _check_bounds(BoundsContext(scenario, free, tune.bounds), name)
 
 
 def _check_objective(scenario: Scenario, tune: tables.Tune, beginning: str) -> None:
-    """Raise ScenarioError if the objective is not possible; beginning: the first words of a message about tune.free."""
+    """Raise ScenarioError if the objective is not possible; `beginning` starts messages about tune.free."""
     if tune.level is not None and tune.statistic not in tables.LEVELS:
         raise ScenarioError(
             f'tune.level is {tune.level}, but is allowed only with tune.statistic = "quantile" or "cvar"'
         )
-    shown = f"tune.minimise is {errors.show(tune.minimise)}"
+    minimised = f"tune.minimise is {errors.show(tune.minimise)}"
     if tune.minimise in (tables.T_F, tables.LIMITS):
         if tune.minimise == tables.T_F and "t_f" not in tune.gains:
             raise ScenarioError(f'{beginning} tune.minimise = "t_f" needs t_f to be free')
         if not scenario.requirements:
             raise ScenarioError(
-                f"{shown}, but there is no requirement; allowed is a metric, or [requirements] with one"
+                f"{minimised}, but there is no requirement; allowed is a metric, or [requirements] with one"
             )
         if tune.torque_weight:
             raise wrong(
                 "tune.torque_weight", tune.torque_weight, f"absent with tune.minimise = {errors.show(tune.minimise)}"
             )
         if tune.statistic != "rms":
-            raise ScenarioError(f"{shown}, which has no statistic, but tune.statistic is {errors.show(tune.statistic)}")
+            raise ScenarioError(
+                f"{minimised}, which has no statistic, but tune.statistic is {errors.show(tune.statistic)}"
+            )
         return
-    known = [name for name in scenario.metrics if name not in catalogues.LARGER_IS_BETTER]
-    if tune.minimise not in known:
-        nearest = parsing.like(tune.minimise, known, "`ptsmc new` lists them")
-        raise ScenarioError(f'{shown}, but must be a metric, "t_f" or "limits"; {nearest}')
-    table = scenario.metrics[tune.minimise].table
-    if table is not None and getattr(scenario, table, None) is None:
-        raise ScenarioError(f"{shown}, which needs [{table}], but there is no [{table}] table")
-    if tune.minimise.startswith(catalogues.KNOWLEDGE) and not scenario.measured:
-        raise ScenarioError(f"{shown}, which needs noise in [hardware]: without it the law sees the true state")
+    metrics = [name for name in scenario.metrics if name not in catalogues.LARGER_IS_BETTER]
+    if tune.minimise not in metrics:
+        nearest = parsing.similar_names_hint(tune.minimise, metrics, "`ptsmc new` lists them")
+        raise ScenarioError(f'{minimised}, but must be a metric, "t_f" or "limits"; {nearest}')
+    table_name = scenario.metrics[tune.minimise].table
+    if table_name is not None and getattr(scenario, table_name, None) is None:
+        raise ScenarioError(f"{minimised}, which needs [{table_name}], but there is no [{table_name}] table")
+    if tune.minimise.startswith(catalogues.KNOWLEDGE) and not scenario.uses_measurements:
+        raise ScenarioError(f"{minimised}, which needs noise in [hardware]: without it the law sees the true state")
 
 
-def _absent(scenario: Scenario, name: str) -> str:
+def _absence_reason(scenario: Scenario, name: str) -> str:
     """Return the reason why a scenario lacks a gain, and the change that provides it."""
     law, observer = (errors.show(table.kind) for table in (scenario.controller, scenario.observer))
     match name:
         case "observer_gain":
-            lacks = f"observer.kind = {observer} has no gain of that name"
-            return f"{lacks}; allowed is observer_gain with an observer of another kind"
+            lack = f"observer.kind = {observer} has no gain of that name"
+            return f"{lack}; allowed is observer_gain with an observer of another kind"
         case "filter_bandwidth":
             return 'there is no filter; allowed is filter_bandwidth with [filter] of kind "steady_state"'
         case "command_corner":
             return "the command is not filtered; allowed is command_corner with hardware.command_filter"
-    known = (*scenario.controller.gains, *scenario.observer.gains, *tables.OF_NO_LAW)
-    lacks = f"the law of controller.kind = {law} has no {name}"
-    return f"{lacks}; allowed is some of {', '.join(dict.fromkeys(known))}"
+    gains = (*scenario.controller.gains, *scenario.observer.gains, *tables.NON_LAW_GAINS)
+    lack = f"the law of controller.kind = {law} has no {name}"
+    return f"{lack}; allowed is some of {', '.join(dict.fromkeys(gains))}"
 
 
-def _check_bounds(choice: Choice, name: str) -> None:
-    key, (lower, upper) = f"tune.bounds.{name}", choice.bounds[name]
-    known = dict.fromkeys((*choice.scenario.gains, *tables.FREE))
-    if name not in known:
-        raise ScenarioError(f"{key} is not a known gain; {parsing.nearest(name, known)}")
-    if name not in choice.free:
-        raise ScenarioError(f"{key} bounds a gain that is not free; tune.free is {errors.brief(choice.free)}")
-    least, most, closed = gain_bounds.bounds_of(choice.scenario, name).allowed(choice)
-    if not (least <= lower if closed else least < lower) or not upper < most:
-        allowed = f"two numbers {'from' if closed else 'above'} {least}"
-        raise wrong(key, [lower, upper], allowed + (f" and below {most}" if math.isfinite(most) else ""))
+def _check_bounds(context: BoundsContext, name: str) -> None:
+    key, (lower, upper) = f"tune.bounds.{name}", context.bounds[name]
+    known_gains = dict.fromkeys((*context.scenario.gains, *tables.TUNABLE_GAINS))
+    if name not in known_gains:
+        raise ScenarioError(f"{key} is not a known gain; {parsing.nearest_name_hint(name, known_gains)}")
+    if name not in context.free:
+        raise ScenarioError(f"{key} bounds a gain that is not free; tune.free is {errors.brief(context.free)}")
+    smallest, largest, is_closed = gain_bounds.bounds_of(context.scenario, name).allowed(context)
+    if not (smallest <= lower if is_closed else smallest < lower) or not upper < largest:
+        allowed = f"two numbers {'from' if is_closed else 'above'} {smallest}"
+        raise wrong(key, [lower, upper], allowed + (f" and below {largest}" if math.isfinite(largest) else ""))
     if lower >= upper:
         raise wrong(key, [lower, upper], "two numbers, the lower bound first and below the upper one")
 
 
-def _default(choice: Choice, name: str) -> tuple[float, float]:
+def _default_bounds(context: BoundsContext, name: str) -> tuple[float, float]:
     """Return the usual bounds, widened if the scenario's gain is outside of them and allowed.
 
     The lower bound moves to the middle between the gain and the smallest allowed value. The upper bound moves to twice
     the gain's distance from the smallest allowed value, at most to the middle between the gain and the largest one.
     """
-    gain = gain_bounds.bounds_of(choice.scenario, name)
-    (low, high), present = gain.usual(choice), _present_values(choice.scenario, name)
-    if present:
-        least, most, closed = gain.allowed(choice)
-        if math.isinf(least):  # a custom gain that may be negative: extend the interval by its width
-            least = min(low, *present) - (high - low)
-        if min(present) < low and (least <= min(present) if closed else least < min(present)):
-            low = (least + min(present)) / 2
-        if high < max(present) < most:
-            high = min(2 * max(present) - least, (max(present) + most) / 2)
+    gain_rules = gain_bounds.bounds_of(context.scenario, name)
+    (low, high), values = gain_rules.usual(context), _present_values(context.scenario, name)
+    if values:
+        smallest, largest, is_closed = gain_rules.allowed(context)
+        if math.isinf(smallest):  # a custom gain that may be negative: extend the interval by its width
+            smallest = min(low, *values) - (high - low)
+        if min(values) < low and (smallest <= min(values) if is_closed else smallest < min(values)):
+            low = (smallest + min(values)) / 2
+        if high < max(values) < largest:
+            high = min(2 * max(values) - smallest, (max(values) + largest) / 2)
     return low, high
 
 
@@ -186,19 +188,19 @@ def reason_of_bound(scenario: Scenario, name: str, side: str, bound: float) -> s
     tune = scenario.tune
     if not scenario.sampled or tune is None:
         return None
-    gain = gain_bounds.bounds_of(scenario, name)
-    words = gain.below if side == "lower" else gain.above
-    if words is None:
+    gain_rules = gain_bounds.bounds_of(scenario, name)
+    reason = gain_rules.reason_below if side == "lower" else gain_rules.reason_above
+    if reason is None:
         return None
-    low, high = usual(scenario, name)
-    reached = bound <= low * (1 + 1e-9) if side == "lower" else bound >= high * (1 - 1e-9)
-    return words if reached else None
+    low, high = usual_bounds(scenario, name)
+    is_reached = bound <= low * (1 + 1e-9) if side == "lower" else bound >= high * (1 - 1e-9)
+    return reason if is_reached else None
 
 
-def beyond(scenario: Scenario, name: str, side: str) -> float | None:
+def value_beyond_bound(scenario: Scenario, name: str, side: str) -> float | None:
     """Return a value of a gain beyond a bound, to test whether the bound limits the objective.
 
-    The value lies a tenth of the interval beyond the bound, on a log scale if the interval is searched on one. It stays
+    The value is a tenth of the interval beyond the bound, on a log scale if the interval is searched on one. It stays
     closer to the bound than to the end of the allowed range.
 
     Args:
@@ -213,57 +215,61 @@ def beyond(scenario: Scenario, name: str, side: str) -> float | None:
     low, high = tune.bounds[name]
     if reason_of_bound(scenario, name, side, low if side == "lower" else high) is not None:
         return None
-    least, most, _ = gain_bounds.bounds_of(scenario, name).allowed(Choice(scenario, tune.gains, tune.bounds))
-    if wide(low, high):
+    smallest, largest, _ = gain_bounds.bounds_of(scenario, name).allowed(
+        BoundsContext(scenario, tune.gains, tune.bounds)
+    )
+    if is_log_scaled(low, high):
         step = (high / low) ** 0.1
         value = low / step if side == "lower" else high * step
     else:
         value = low - 0.1 * (high - low) if side == "lower" else high + 0.1 * (high - low)
-    value = max(value, 0.5 * (least + low)) if side == "lower" else min(value, 0.5 * (most + high))
+    value = max(value, 0.5 * (smallest + low)) if side == "lower" else min(value, 0.5 * (largest + high))
     return None if value in (low, high) else float(f"{value:.4g}")  # None if the bound is the end of the allowed range
 
 
-def widened(
+def widen_bounds(
     scenario: Scenario, sides: Mapping[str, str], defaulted: Container[tuple[str, ...]]
 ) -> dict[str, tuple[float, float]]:
     """Return wider bounds for gains that ended on a default bound, by name.
 
     A bound on a log scale moves by a factor of ten, and a bound on a linear scale by half of the interval. Neither
-    moves more than half way to the end of the allowed range. A bound stays if the loop is unstable beyond it, or if
-    the gain has no influence there.
+    moves more than half way to the end of the allowed range. A bound does not move if the loop is unstable beyond
+    it, or if the gain has no influence there.
 
     Args:
-        scenario: with the bounds that were searched.
+        scenario: scenario whose bounds were searched.
         sides: "lower" or "upper" for each gain on a bound, by its name.
         defaulted: paths of the keys that the user's scenario leaves out.
     """
-    tune, found = scenario.search, dict[str, tuple[float, float]]()
+    tune, wider = scenario.search, dict[str, tuple[float, float]]()
     for name, side in sides.items():
         low, high = tune.bounds[name]
-        by_default = ("tune", "bounds", name) in defaulted
-        if not by_default or reason_of_bound(scenario, name, side, low if side == "lower" else high) is not None:
+        is_default = ("tune", "bounds", name) in defaulted
+        if not is_default or reason_of_bound(scenario, name, side, low if side == "lower" else high) is not None:
             continue
-        least, most, _ = gain_bounds.bounds_of(scenario, name).allowed(Choice(scenario, tune.gains, tune.bounds))
+        smallest, largest, _ = gain_bounds.bounds_of(scenario, name).allowed(
+            BoundsContext(scenario, tune.gains, tune.bounds)
+        )
         if name == "delta":  # the upper bound stays: the clock has samples for it only
-            most = high
-        if side == "lower" and wide(low, high) and math.isfinite(least):
-            low = least + 0.1 * (low - least)
+            largest = high
+        if side == "lower" and is_log_scaled(low, high) and math.isfinite(smallest):
+            low = smallest + 0.1 * (low - smallest)
         elif side == "lower":
-            low = max(low - 0.5 * (high - low), 0.5 * (least + low))
+            low = max(low - 0.5 * (high - low), 0.5 * (smallest + low))
         else:
-            high = min(10.0 * high if wide(low, high) else high + 0.5 * (high - low), 0.5 * (most + high))
+            high = min(10.0 * high if is_log_scaled(low, high) else high + 0.5 * (high - low), 0.5 * (largest + high))
         if (low, high) != tune.bounds[name]:
-            found[name] = low, high
-    return found
+            wider[name] = low, high
+    return wider
 
 
-def usual(scenario: Scenario, name: str) -> tuple[float, float]:
+def usual_bounds(scenario: Scenario, name: str) -> tuple[float, float]:
     """Return the usual bounds of a free gain, before they are widened to include the scenario's gain."""
     tune = scenario.search
-    return gain_bounds.bounds_of(scenario, name).usual(Choice(scenario, tune.gains, tune.bounds))
+    return gain_bounds.bounds_of(scenario, name).usual(BoundsContext(scenario, tune.gains, tune.bounds))
 
 
-def by_default(scenario: Scenario, name: str) -> tuple[float, float]:
+def default_bounds(scenario: Scenario, name: str) -> tuple[float, float]:
     """Return the default bounds of a free gain: the usual ones, widened to include the scenario's gain."""
     tune = scenario.search
-    return _default(Choice(scenario, tune.gains, tune.bounds), name)
+    return _default_bounds(BoundsContext(scenario, tune.gains, tune.bounds), name)

@@ -14,7 +14,7 @@ Quaternion = Annotated[
     Meta(description="a list of four names of columns, in the order of `quaternion_order`"),
 ]
 Axes = Annotated[tuple[Column, Column, Column], Meta(description="a list of three names of columns")]
-NOT_THERE = "; default: {}, if the log has them"
+IF_LOGGED = "; default: {}, if the log has them"
 
 
 class Telemetry(Table, frozen=True):
@@ -23,7 +23,7 @@ class Telemetry(Table, frozen=True):
     time: Annotated[Column, Meaning("time in s, or date and time in ISO 8601")] = "t"
     attitude: Annotated[
         Quaternion | None,
-        Meaning("unit quaternion of the star tracker" + NOT_THERE.format("measured_q1 to measured_q4")),
+        Meaning("unit quaternion of the star tracker" + IF_LOGGED.format("measured_q1 to measured_q4")),
     ] = None
     quaternion_order: Annotated[Literal["xyzw", "wxyz"], Meaning("scalar part last or first")] = "xyzw"
     rotation: Annotated[
@@ -32,9 +32,9 @@ class Telemetry(Table, frozen=True):
     ] = "body_to_inertial"
     attitude_age: Annotated[
         Column | None,
-        Meaning("age of the attitude in s" + NOT_THERE.format("measured_age")),
+        Meaning("age of the attitude in s" + IF_LOGGED.format("measured_age")),
     ] = None
-    rate: Annotated[Axes | None, Meaning("body rate of the gyro" + NOT_THERE.format("measured_w1 to measured_w3"))] = (
+    rate: Annotated[Axes | None, Meaning("body rate of the gyro" + IF_LOGGED.format("measured_w1 to measured_w3"))] = (
         None
     )
     rate_unit: Annotated[Literal["rad/s", "deg/s", "deg/h"], Meaning("unit of the rate columns")] = "rad/s"
@@ -42,7 +42,7 @@ class Telemetry(Table, frozen=True):
         Axes | None,
         Meaning(
             "torque in body axes that the computer sends to the actuators, held until the next row"
-            + NOT_THERE.format("sent1 to sent3")
+            + IF_LOGGED.format("sent1 to sent3")
         ),
     ] = None
     wheel_torque: Annotated[
@@ -105,8 +105,8 @@ def check(identify: Any, telemetry: Any) -> None:
         raise wrong("identify.free", identify.free, "a list of different names")
     if not isinstance(telemetry, Telemetry):
         return
-    inputs = [key for key in ("torque", "wheel_torque", "wheel_speed") if getattr(telemetry, key) is not None]
-    if len(inputs) > 1:
-        raise ScenarioError(f"telemetry has {' and '.join(inputs)}, but must have one of them")
+    input_keys = [key for key in ("torque", "wheel_torque", "wheel_speed") if getattr(telemetry, key) is not None]
+    if len(input_keys) > 1:
+        raise ScenarioError(f"telemetry has {' and '.join(input_keys)}, but must have one of them")
     if telemetry.wheel_speed is not None and telemetry.wheel_inertia is None:
         raise ScenarioError("telemetry.wheel_inertia is absent, but must be given with telemetry.wheel_speed")

@@ -17,78 +17,78 @@ Schema = dict[str, Any]
 
 def json_schema() -> Schema:
     """Return the JSON Schema (draft 2020-12) of scenario files for a spacecraft, a chain or a system."""
-    plants = [_plant(kind, made) for kind, made in layouts.SCENARIOS.items()]
+    schemas = [_plant_schema(kind, scenario) for kind, scenario in layouts.SCENARIOS.items()]
     dialect = "https://json-schema.org/draft/2020-12/schema"
-    return {"$schema": dialect, "title": "Scenario of ptsmc", "anyOf": plants}
+    return {"$schema": dialect, "title": "Scenario of ptsmc", "anyOf": schemas}
 
 
-def _plant(kind: str, made: type[Scenario]) -> Schema:
-    tables = {name: _kinds(name, kinds, made.unit_of_d) for name, kinds in made.TABLES.items()}
+def _plant_schema(kind: str, scenario: type[Scenario]) -> Schema:
+    tables = {name: _kinds_schema(name, kinds, scenario.unit_of_d) for name, kinds in scenario.TABLES.items()}
     if kind == "spacecraft":
-        each = {"type": "array", "items": _kinds("sensors", sensor_tables.SENSORS, made.unit_of_d)}
-        tables["sensors"] = {"anyOf": [tables["sensors"], each]}
+        sensor_list = {"type": "array", "items": _kinds_schema("sensors", sensor_tables.SENSORS, scenario.unit_of_d)}
+        tables["sensors"] = {"anyOf": [tables["sensors"], sensor_list]}
     tables["plant"]["required"] = ["kind"]
     tables["plant"]["properties"]["kind"] = {"const": kind}
-    limit = _with_unit(_leaf(NotNegative), {})
-    full = _struct(Limit, made.unit_of_d)
-    full["properties"]["limit"] = limit
-    limits = {"anyOf": [limit, full | {"required": ["limit"]}]}
-    metrics = {**made.metrics, **catalogues.MARGINS}
-    named = {name: limits | {"description": f"{one.meaning} [{one.unit}]"} for name, one in metrics.items()}
-    tables["requirements"] = _object("Largest values that are allowed.", named)
+    limit = _allow_unit_text(_value_schema(NotNegative), {})
+    limit_table = _table_schema(Limit, scenario.unit_of_d)
+    limit_table["properties"]["limit"] = limit
+    limit_or_table = {"anyOf": [limit, limit_table | {"required": ["limit"]}]}
+    metrics = {**scenario.metrics, **catalogues.MARGINS}
+    limits = {name: limit_or_table | {"description": f"{one.meaning} [{one.unit}]"} for name, one in metrics.items()}
+    tables["requirements"] = _object_schema("Largest values that are allowed.", limits)
     required = [] if kind == next(iter(layouts.SCENARIOS)) else ["plant"]
-    return _object(f"Scenario of a {kind}.", tables) | {"required": required}
+    return _object_schema(f"Scenario of a {kind}.", tables) | {"required": required}
 
 
-def _kinds(name: str, kinds: type[Table] | Kinds, unit_of_d: str) -> Schema:
+def _kinds_schema(name: str, kinds: type[Table] | Kinds, unit_of_d: str) -> Schema:
     """Return the schema of a table: one object for each kind. The key `kind` is optional for the default kind."""
     if not isinstance(kinds, Mapping):
-        return _struct(kinds, unit_of_d, name)
-    first, found = next(iter(kinds)), []
+        return _table_schema(kinds, unit_of_d, name)
+    default_kind, schemas = next(iter(kinds)), []
     for kind, struct in kinds.items():
-        one = _struct(struct, unit_of_d, name)
-        required = [] if kind == first else ["kind"]
-        one["properties"] = {"kind": {"const": kind}, **one["properties"]}
+        schema = _table_schema(struct, unit_of_d, name)
+        required = [] if kind == default_kind else ["kind"]
+        schema["properties"] = {"kind": {"const": kind}, **schema["properties"]}
         if struct is disturbance_tables.SumDisturbance:
-            one["properties"]["terms"] |= {
-                "items": _kinds(name, disturbance_tables.single(kinds), unit_of_d),
+            schema["properties"]["terms"] |= {
+                "items": _kinds_schema(name, disturbance_tables.without_sums(kinds), unit_of_d),
                 "minItems": 1,
             }
             required.append("terms")
-        found.append(one | {"required": required} if required else one)
-    return {"anyOf": found}
+        schemas.append(schema | {"required": required} if required else schema)
+    return {"anyOf": schemas}
 
 
-def _struct(struct: type[Table], unit_of_d: str, name: str = "") -> Schema:
-    """Return the schema of a table of one kind; name: of the table, for its inline tables."""
+def _table_schema(struct: type[Table], unit_of_d: str, name: str = "") -> Schema:
+    """Return the schema of a table of one kind; `name`: the table's name, for inline tables."""
     hints, properties = typing.get_type_hints(struct, include_extras=True), {}
     for key in keys.list_keys(struct, unit_of_d):
         inline = layouts.DISPERSIONS.get(key.name) if name == "dispersion" else layouts.KINDS.get(f"{name}.{key.name}")
-        one = _leaf(hints[key.name]) if inline is None else _kinds("", inline, unit_of_d)
+        schema = _value_schema(hints[key.name]) if inline is None else _kinds_schema("", inline, unit_of_d)
         if key.unit in catalogues.UNITS:
-            one = _with_unit(one, one.pop("items", {}))
+            schema = _allow_unit_text(schema, schema.pop("items", {}))
         if isinstance(key.default, bool | int | float | str):
-            one["default"] = key.default
-        properties[key.name] = one | {"description": key.text if inline else f"{key.text}: {key.allowed}"}
-    return _object(keys.about(struct), properties, more=issubclass(struct, Custom))
+            schema["default"] = key.default
+        properties[key.name] = schema | {"description": key.text if inline else f"{key.text}: {key.allowed}"}
+    return _object_schema(keys.description(struct), properties, allow_more=issubclass(struct, Custom))
 
 
-def _object(description: str, properties: Schema, *, more: bool = False) -> Schema:
-    head = {"type": "object", "description": description}
-    return {**head, "properties": properties, "additionalProperties": more}
+def _object_schema(description: str, properties: Schema, *, allow_more: bool = False) -> Schema:
+    beginning = {"type": "object", "description": description}
+    return {**beginning, "properties": properties, "additionalProperties": allow_more}
 
 
-def _leaf(hint: Any) -> Schema:
+def _value_schema(hint: Any) -> Schema:
     """Return the schema of a value, without null for a default of None."""
-    found: Schema = msgspec.json.schema(hint)
-    some = [one for one in found.get("anyOf", []) if one.get("type") != "null"]
-    one = {**(some[0] if len(some) == 1 else found)}
-    if "prefixItems" in one and all(other == one["prefixItems"][0] for other in one["prefixItems"]):
-        one["items"] = one.pop("prefixItems")[0]
-    return one
+    schema: Schema = msgspec.json.schema(hint)
+    not_null = [value for value in schema.get("anyOf", []) if value.get("type") != "null"]
+    value = {**(not_null[0] if len(not_null) == 1 else schema)}
+    if "prefixItems" in value and all(item == value["prefixItems"][0] for item in value["prefixItems"]):
+        value["items"] = value.pop("prefixItems")[0]
+    return value
 
 
-def _with_unit(number: Schema, items: Schema) -> Schema:
+def _allow_unit_text(number: Schema, items: Schema) -> Schema:
     """Return the schema of a number, or of a list of numbers, and allow texts with a unit as numbers."""
     if items:
         return {**number, "items": {"anyOf": [items, {"type": "string"}]}}

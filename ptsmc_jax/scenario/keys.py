@@ -43,30 +43,31 @@ def list_keys(struct: type[Table], unit_of_d: str = UNIT_OF_D) -> list[Key]:
     """
     hints = typing.get_type_hints(struct, include_extras=True)
     declared: Mapping[str, Declaration] = getattr(struct, "declared", {})
-    found = []
+    keys = []
     for field in msgspec.structs.fields(struct):
         if field.name in ("kind", "rest"):
             continue
-        factory, unit_here = field.default_factory, unit_of_d
+        factory, plant_unit = field.default_factory, unit_of_d
         default = field.default if factory is msgspec.NODEFAULT else factory()
         if field.name in declared:
-            one, body = declared[field.name], struct.body  # pyright: ignore[reportAttributeAccessIssue]
-            meaning, unit = one.meaning, one.unit if isinstance(one.unit, str) else one.unit[not body]
-            unit_here = "N m" if body else unit_of_d
+            declaration, body = declared[field.name], struct.body  # pyright: ignore[reportAttributeAccessIssue]
+            meaning, unit = declaration.meaning, declaration.unit
+            unit = unit if isinstance(unit, str) else unit[not body]
+            plant_unit = "N m" if body else unit_of_d
         else:
             meaning, unit = next(one for one in hints[field.name].__metadata__ if isinstance(one, Meaning))
-        unit = unit.replace(UNIT_OF_D, unit_here)
-        unit = unit.replace("unit of u", "N m") if unit_here == "N m" else unit
-        found.append(Key(field.name, meaning, unit, allowed(hints[field.name]), default))
-    return found
+        unit = unit.replace(UNIT_OF_D, plant_unit)
+        unit = unit.replace("unit of u", "N m") if plant_unit == "N m" else unit
+        keys.append(Key(field.name, meaning, unit, allowed_values(hints[field.name]), default))
+    return keys
 
 
-def about(struct: type[Table]) -> str:
+def description(struct: type[Table]) -> str:
     """Return the description of a table or of one of its kinds: its docstring, which python -OO removes."""
     return " ".join((struct.__doc__ or "").split())
 
 
-def kinds_with(name: str, key: str, struct: type[Table], kinds: Kinds) -> str:
+def hint_other_kinds(name: str, key: str, struct: type[Table], kinds: Kinds) -> str:
     """Return a hint that a key belongs to other kinds of a table, empty if no other kind has it.
 
     Args:
@@ -75,23 +76,23 @@ def kinds_with(name: str, key: str, struct: type[Table], kinds: Kinds) -> str:
         struct: class of the table, one of `kinds`.
         kinds: classes by kind.
     """
-    others = [f'"{kind}"' for kind, other in kinds.items() if key in other.__struct_fields__]
+    other_kinds = [f'"{kind}"' for kind, other in kinds.items() if key in other.__struct_fields__]
     this_kind = next((kind for kind, other in kinds.items() if other is struct), None)
-    return f' of {name}.kind = "{this_kind}", but of {", ".join(others)}' if others else ""
+    return f' of {name}.kind = "{this_kind}", but of {", ".join(other_kinds)}' if other_kinds else ""
 
 
-def homes(layout: Mapping[str, type[Table] | Kinds]) -> dict[str, list[str]]:
+def table_names_by_key(layout: Mapping[str, type[Table] | Kinds]) -> dict[str, list[str]]:
     """Return the names of the tables that have a key, for each key except "kind"."""
-    found: dict[str, list[str]] = {}
+    names: dict[str, list[str]] = {}
     for name, table in layout.items():
         for struct in table.values() if isinstance(table, Mapping) else [table]:
             for key in struct.__struct_fields__:
-                if key != "kind" and name not in found.setdefault(key, []):
-                    found[key].append(name)
-    return found
+                if key != "kind" and name not in names.setdefault(key, []):
+                    names[key].append(name)
+    return names
 
 
-def elsewhere(name: str, key: str, layout: Mapping[str, type[Table] | Kinds]) -> str:
+def hint_other_tables(name: str, key: str, layout: Mapping[str, type[Table] | Kinds]) -> str:
     """Return a hint that other tables have a key, such as "loop.period is".
 
     Args:
@@ -102,25 +103,25 @@ def elsewhere(name: str, key: str, layout: Mapping[str, type[Table] | Kinds]) ->
     Returns:
         The hint, empty if the table has the key itself or if no table has it.
     """
-    known = homes(layout).get(key, [])
-    if name in known or not known:
+    names = table_names_by_key(layout).get(key, [])
+    if name in names or not names:
         return ""
-    return f"{', '.join(f'{home}.{key}' for home in known)} {'are' if known[1:] else 'is'}"
+    return f"{', '.join(f'{other}.{key}' for other in names)} {'are' if names[1:] else 'is'}"
 
 
-def bare(kind: Any) -> Any:
+def without_annotations(kind: Any) -> Any:
     """Return a type without its annotations."""
     return kind.__origin__ if hasattr(kind, "__metadata__") else kind
 
 
-def allowed(kind: Any) -> str:
+def allowed_values(kind: Any) -> str:
     """Return the values that a type allows, in words."""
-    limits = next((one for one in getattr(kind, "__metadata__", ()) if isinstance(one, msgspec.Meta)), None)
-    if limits is not None and limits.description is not None:
-        return limits.description
-    kind = bare(kind)
+    meta = next((one for one in getattr(kind, "__metadata__", ()) if isinstance(one, msgspec.Meta)), None)
+    if meta is not None and meta.description is not None:
+        return meta.description
+    kind = without_annotations(kind)
     if typing.get_origin(kind) in (types.UnionType, typing.Union):
-        return " or ".join(dict.fromkeys(allowed(k) for k in typing.get_args(kind) if k is not type(None)))
+        return " or ".join(dict.fromkeys(allowed_values(k) for k in typing.get_args(kind) if k is not type(None)))
     if isinstance(kind, type) and issubclass(kind, Table):
         return "an inline table"
     if typing.get_origin(kind) is Literal:

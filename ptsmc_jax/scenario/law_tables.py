@@ -15,7 +15,7 @@ from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.scenario import disturbance_bounds, mission
 from ptsmc_jax.scenario.custom import custom_kind
 from ptsmc_jax.scenario.errors import show, wrong
-from ptsmc_jax.scenario.schema import PartTable, table
+from ptsmc_jax.scenario.schema import PartTable, make_table
 from ptsmc_jax.scenario.values import Meaning, NotNegative, Positive
 
 KINEMATICS = {"chain": kinematics.ChainKinematics, "system": kinematics.SecondOrderKinematics}
@@ -59,7 +59,7 @@ class LawTable(PartTable, frozen=True):
     @property
     def law(self) -> Any:
         """The class of the law, `AccelerationLaw` for a custom law whose code has not run yet."""
-        return self.made or AccelerationLaw
+        return self.part_class or AccelerationLaw
 
     def kinematics(self, motion: str) -> Any:
         """Return the class of the error kinematics for plants of this `Scenario.motion`."""
@@ -70,45 +70,45 @@ class LawTable(PartTable, frozen=True):
 
     def free(self, *, sampled: bool) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Return the law's gains that are free by default: those before and those after the observer's in the list."""
-        rest = self.free_if_sampled if sampled else ()  # implicit sampling has no boundary layer
-        return self.free_by_default, tuple(name for name in rest if not (self.implicit and name == "sign_width"))
+        extra = self.free_if_sampled if sampled else ()  # implicit sampling has no boundary layer
+        return self.free_by_default, tuple(name for name in extra if not (self.implicit and name == "sign_width"))
 
-    def filled(self, scenario: Any) -> Any:
+    def fill_defaults(self, scenario: Any) -> Any:
         """Fill absent bounds of Assumption 1 from the disturbance, then absent gains by `designed`."""
-        found = disturbance_bounds.compute(scenario)
-        if found is not None:
-            self = self._with(dict(zip(("disturbance_bound", "disturbance_rate_bound"), found, strict=True)))
-        made = self._with(self.designed(msgspec.structs.replace(scenario, controller=self)))
-        made = made._with(made.published_in(mission.scales(scenario)))
-        delta, by_default = getattr(made, "delta", None), getattr(self, "delta", 0.0) is None
+        bounds = disturbance_bounds.compute(scenario)
+        if bounds is not None:
+            self = self._fill_absent(dict(zip(("disturbance_bound", "disturbance_rate_bound"), bounds, strict=True)))
+        filled = self._fill_absent(self.designed(msgspec.structs.replace(scenario, controller=self)))
+        filled = filled._fill_absent(filled.published_in(mission.scales(scenario)))
+        delta, by_default = getattr(filled, "delta", None), getattr(self, "delta", 0.0) is None
         if scenario.sampled and by_default and delta is not None:
-            made = msgspec.structs.replace(made, delta=max(delta, scenario.loop.period))
-        return made
+            filled = msgspec.structs.replace(filled, delta=max(delta, scenario.loop.period))
+        return filled
 
-    def _with(self, follows: Mapping[str, Any]) -> Any:
+    def _fill_absent(self, defaults: Mapping[str, Any]) -> Any:
         """Return the table with these values for its absent keys."""
-        return msgspec.structs.replace(self, **{k: v for k, v in follows.items() if getattr(self, k) is None})
+        return msgspec.structs.replace(self, **{k: v for k, v in defaults.items() if getattr(self, k) is None})
 
     def designed(self, scenario: Any) -> Mapping[str, float]:
         """Return the gains that are designed for the sampled loop, by key.
 
-        There are none if the loop is continuous or if the scenario is a published case: `filled` then uses the
+        There are none if the loop is continuous or if the scenario is a published case: `fill_defaults` then uses the
         published gains, scaled to the mission.
         """
-        if not scenario.sampled or mission.published(scenario):
+        if not scenario.sampled or mission.is_published_case(scenario):
             return {}
         return self.gains_of(mission.design(scenario), scenario)
 
-    def published_in(self, units: mission.Scales) -> dict[str, Any]:
+    def published_in(self, scales: mission.Scales) -> dict[str, Any]:
         """Return the published gains by key, scaled to the units of a mission."""
-        return {key: units.of(scaled, self) for key, scaled in self.scaled.items()}
+        return {key: scales.scaled_value(scaled, self) for key, scaled in self.scaled.items()}
 
     def gains_of(self, design: mission.Design, scenario: Any) -> Mapping[str, float]:
         """Return this law's gains for a design of the sampled loop, by key.
 
         The law receives the published gains, scaled to the bandwidth of the design.
         """
-        published = self.published_in(mission.scales(scenario)._replace(time=1.0 / design.rate))
+        published = self.published_in(mission.scales(scenario)._replace(time=1.0 / design.rate_factor))
         return self.law.designed(design, published)
 
     def noise_of_s(self, position: float, velocity: float) -> float:
@@ -121,23 +121,23 @@ class LawTable(PartTable, frozen=True):
         return self.law.noise_of_s(self, position, velocity)
 
     def half_turn_rate(self, t_f: float) -> tuple[str, float]:
-        """Return the key that determines how fast the law turns the body, and the largest rate [rad/s]; t_f: [s]."""
+        """Return the key that determines how fast the law turns the body, and the largest rate [rad/s]; `t_f` in s."""
         key, rate = self.law.half_turn_rate(self, t_f)
         return f"controller.{key}", rate
 
     def check(self, scenario: Any) -> None:
         """Raise ScenarioError if keys contradict each other or the scenario."""
         if not self.law.prescribed and scenario.order != 2:
-            needed = f"2 with controller.kind = {show(scenario.controller.kind)}, a law of second order"
-            raise wrong("plant.order", scenario.order, needed)
-        found: tuple[str, str] | None = self.law.refusal(self, scenario.order)
-        if found is not None:
-            raise wrong(f"controller.{found[0]}", getattr(self, found[0]), found[1])
+            allowed = f"2 with controller.kind = {show(scenario.controller.kind)}, a law of second order"
+            raise wrong("plant.order", scenario.order, allowed)
+        refusal: tuple[str, str] | None = self.law.refusal(self, scenario.order)
+        if refusal is not None:
+            raise wrong(f"controller.{refusal[0]}", getattr(self, refusal[0]), refusal[1])
         if self.implicit:
-            scenario.need_samples('controller.sampling = "implicit"')
+            scenario.require_sampled_loop('controller.sampling = "implicit"')
 
     def build(self, scenario: Any, model: Any) -> Any:
-        """Return the law for the design model of the plant, see `Scenario.model`."""
+        """Return the law for the design model of the plant, see `Scenario.design_model`."""
         law = self.part(kinematics=self.kinematics(scenario.motion)(model), delta=vector(scenario.hand_over))
         return dataclasses.replace(law, implicit=True) if self.implicit else law
 
@@ -203,22 +203,22 @@ COMPARISON = {
     "predefined_time": baselines.PredefinedTime,
     "super_twisting": baselines.SuperTwisting,
 }
-BASELINES = {kind: table(LawTable, made, kind) for kind, made in COMPARISON.items()}
+BASELINES = {kind: make_table(LawTable, made, kind) for kind, made in COMPARISON.items()}
 _SUMMARY = "A custom law, a class derived from ptsmc_jax.AccelerationLaw; its fields are further keys."
 _NEEDS = ("acceleration", "__call__")
 # by the kind of the plant and the kind of the law, the default first
 LAWS: dict[str, Mapping[str, type[LawTable]]] = {
     "spacecraft": {
-        "prescribed_time": table(AttitudeTable, prescribed_time.PrescribedTime, "prescribed_time"),
+        "prescribed_time": make_table(AttitudeTable, prescribed_time.PrescribedTime, "prescribed_time"),
         **BASELINES,
-        "pd": table(LawTable, baselines.QuaternionPD, "pd"),
-        "custom": custom_kind(CustomAttitudeTable, AccelerationLaw, _NEEDS, _SUMMARY, tuned=True),
+        "pd": make_table(LawTable, baselines.QuaternionPD, "pd"),
+        "custom": custom_kind(CustomAttitudeTable, AccelerationLaw, _NEEDS, _SUMMARY, has_gains=True),
     },
     **{
         plant: {
-            "prescribed_time": table(PrescribedTable, made, "prescribed_time", body=False),
+            "prescribed_time": make_table(PrescribedTable, made, "prescribed_time", body=False),
             **BASELINES,
-            "custom": custom_kind(CustomTable, AccelerationLaw, _NEEDS, _SUMMARY, tuned=True),
+            "custom": custom_kind(CustomTable, AccelerationLaw, _NEEDS, _SUMMARY, has_gains=True),
         }
         for plant, made in (
             ("chain", prescribed_time.PrescribedTimeChain),

@@ -12,13 +12,15 @@ from ptsmc_jax.scenario.state_scenario import ChainScenario, SystemScenario
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.values import Kinds, Table
 
-# by the kind of the plant, the default first
+# scenario classes by the kind of the plant, the default first
 SCENARIOS: dict[str, type[Scenario]] = {
     "spacecraft": SpacecraftScenario,
     "chain": ChainScenario,
     "system": SystemScenario,
 }
-TABLES: dict[str, Mapping[str, type[Table] | Kinds]] = {kind: made.TABLES for kind, made in SCENARIOS.items()}
+TABLES: dict[str, Mapping[str, type[Table] | Kinds]] = {
+    kind: scenario_class.TABLES for kind, scenario_class in SCENARIOS.items()
+}
 OPTIONAL = (
     "orbit",
     "flexible",

@@ -2,7 +2,7 @@
 
 Every default with a unit scales with t_f and with the mean moment of inertia of the body. A scenario that is stated in
 other units of time and inertia therefore gets the same defaults in those units. The published cases keep the published
-numbers (`published`). Start with `scales` and `design`.
+numbers (`is_published_case`). Start with `scales` and `design`.
 """
 
 import math
@@ -21,16 +21,16 @@ CHAIN_TIME = 5.0  # t_f of the published integrator chains [s]
 
 # Largest p T, with p the rate of both hold poles and T the dead time. With an observer of l / J = p / 2 the loop then
 # has a phase margin of 35 deg and a gain margin of 7 dB.
-STABLE = 0.25
-OBSERVER = 0.5  # observer rate l / J, relative to the pole rate p
+MAX_POLE_TIMES_DEAD_TIME = 0.25
+OBSERVER_TO_POLE = 0.5  # observer rate l / J, relative to the pole rate p
 # Modes with w T below this are phase stabilised: the resonance circle in the Nyquist plot stays 30 deg away from -1.
-FASTEST_MODE = math.pi / 3
-SIGMAS = 5.0  # largest noise sample assumed, in standard deviations
+MAX_MODE_PHASE = math.pi / 3
+NOISE_SIGMAS = 5.0  # largest noise sample assumed, in standard deviations
 NOISE_FRACTION = 0.5  # fraction of the torque limit that noise may use
-SLOWEST = 20.0  # smallest product p t_f: the error then decays for five time constants within t_f / 4
-SLOWEST_OBSERVER = 1.5  # smallest product of t_f and the observer rate l / J
-LEAST_ETA = 2.4  # below 2.386 the braking peak exceeds the first torque, see `theory.rules.later_peak_ratio`
-TRIED = 256  # rates p among which the most accurate one is chosen
+MIN_POLE_TIMES_T_F = 20.0  # smallest product p t_f: the error then decays for five time constants within t_f / 4
+MIN_OBSERVER_TIMES_T_F = 1.5  # smallest product of t_f and the observer rate l / J
+SMALLEST_USEFUL_ETA = 2.4  # below 2.386 the braking peak exceeds the first torque, see `theory.rules.later_peak_ratio`
+POLE_CANDIDATES = 256  # rates p among which the most accurate one is chosen
 
 
 class Scales(NamedTuple):
@@ -41,7 +41,7 @@ class Scales(NamedTuple):
     order: int = 2  # order n of the plant
     inputs: int = 3  # number of inputs of the plant
 
-    def of(self, scaled: Scaled, table: Any = None) -> Any:
+    def scaled_value(self, scaled: Scaled, table: Any = None) -> Any:
         """Return a published number, or a tuple of numbers, in these units.
 
         Args:
@@ -61,14 +61,14 @@ class Scales(NamedTuple):
                 "one, so default gains overflow or underflow; allowed are numbers nearer to the published ones",
                 key="controller.t_f",
             )
-        return _times((scaled.value,) * self.inputs if scaled.each else scaled.value, factor)
+        return _multiply((scaled.value,) * self.inputs if scaled.each else scaled.value, factor)
 
 
-def _times(value: Any, factor: float) -> Any:
-    return tuple(_times(one, factor) for one in value) if isinstance(value, tuple) else factor * value
+def _multiply(value: Any, factor: float) -> Any:
+    return tuple(_multiply(one, factor) for one in value) if isinstance(value, tuple) else factor * value
 
 
-def published(scenario: Any) -> bool:
+def is_published_case(scenario: Any) -> bool:
     """Whether the scenario is one of the published cases, which keep the published numbers."""
     t_f = scenario.controller.t_f
     if scenario.moments[0] is None:
@@ -82,24 +82,24 @@ def scales(scenario: Any) -> Scales:
     Both are 1 for a published case. The inertia is 1 for a plant without a body.
     """
     plant, mean, t_f = (scenario.order, scenario.inputs), scenario.moments[0], scenario.controller.t_f
-    if published(scenario):
+    if is_published_case(scenario):
         return Scales(1.0, 1.0, *plant)
     if mean is None:
         return Scales(1.0, t_f / CHAIN_TIME, *plant)
     return Scales(mean / PAPER_INERTIA[1], t_f / PAPER_TIMES[0], *plant)
 
 
-def with_defaults(table: Any, units: Scales) -> Any:
+def fill_scaled_defaults(table: Any, ratios: Scales) -> Any:
     """Fill absent keys with published numbers in the mission's units, in this table and in the tables inside it."""
     changes: dict[str, Any] = {}
     for key in table.__struct_fields__:
         value = getattr(table, key)
         if value is None and key in table.scaled:
-            changes[key] = units.of(table.scaled[key], table)
+            changes[key] = ratios.scaled_value(table.scaled[key], table)
         elif isinstance(value, Table):
-            changes[key] = with_defaults(value, units)
+            changes[key] = fill_scaled_defaults(value, ratios)
         elif isinstance(value, tuple) and value and isinstance(value[0], Table):
-            changes[key] = tuple(with_defaults(one, units) for one in value)
+            changes[key] = tuple(fill_scaled_defaults(one, ratios) for one in value)
     return msgspec.structs.replace(table, **changes) if changes else table
 
 
@@ -123,32 +123,33 @@ class Design(NamedTuple):
         return (2.0 * self.eta - 1.0) / (2.0 * self.pole)
 
     @property
-    def rate(self) -> float:
+    def rate_factor(self) -> float:
         """Factor on published gains that scale with 1 / t_f: 1 / `time`, but at most the number 2 p in 1/s."""
         return min(1.0 / self.time, 2.0 * self.pole)
 
 
-class _Limits(NamedTuple):
-    """Smallest, most accurate and largest pole rate p [1/s]."""
+class _PoleRange(NamedTuple):
+    """Slowest, most accurate and fastest pole rate p [1/s]."""
 
-    least: float
-    accurate: float
-    most: float
+    slowest: float
+    most_accurate: float
+    fastest: float
 
 
 def design(scenario: Any) -> Design:
     """Return the design whose predicted error in the hold phase is the smallest."""
-    return _design(scenario, _limits(scenario).accurate, _eta(scenario), OBSERVER)
+    return _design(scenario, _pole_range(scenario).most_accurate, _default_eta(scenario), OBSERVER_TO_POLE)
 
 
-def designs(scenario: Any) -> list[Design]:
+def starting_designs(scenario: Any) -> list[Design]:
     """Return starting points of a search: slow to fast hold phases, slow and fast observers, the default first."""
-    limits, eta, stable = _limits(scenario), _eta(scenario), STABLE / dead_time(scenario)
-    rates = [limits.accurate, limits.most, math.sqrt(limits.least * limits.most), limits.least]
-    rates += [max(rate, limits.least) for rate in (stable, math.sqrt(limits.most * stable))]
-    rates = [*dict.fromkeys(rates)]
-    found = [_design(scenario, rate, eta, observer) for observer in (OBSERVER, 0.1) for rate in rates]
-    return [*found, _design(scenario, limits.accurate, _least_eta(scenario), 0.3)]
+    poles, eta = _pole_range(scenario), _default_eta(scenario)
+    stable_pole = MAX_POLE_TIMES_DEAD_TIME / dead_time(scenario)
+    pole_rates = [poles.most_accurate, poles.fastest, math.sqrt(poles.slowest * poles.fastest), poles.slowest]
+    pole_rates += [max(rate, poles.slowest) for rate in (stable_pole, math.sqrt(poles.fastest * stable_pole))]
+    pole_rates = [*dict.fromkeys(pole_rates)]
+    designs = [_design(scenario, rate, eta, observer) for observer in (OBSERVER_TO_POLE, 0.1) for rate in pole_rates]
+    return [*designs, _design(scenario, poles.most_accurate, _smallest_eta(scenario), 0.3)]
 
 
 def dead_time(scenario: Any) -> float:
@@ -164,26 +165,26 @@ def dead_time(scenario: Any) -> float:
 
 def fastest_pole(scenario: Any) -> float:
     """Return the largest p [1/s] that dead time, flexible modes, and noise against the torque limit allow."""
-    stable = STABLE * 2.0 / scenario.order  # n poles at -p put the crossover near n p
-    return min(stable / dead_time(scenario), _with_modes(scenario), _with_noise(scenario))
+    stable = MAX_POLE_TIMES_DEAD_TIME * 2.0 / scenario.order  # n poles at -p put the crossover near n p
+    return min(stable / dead_time(scenario), _pole_limit_of_modes(scenario), _pole_limit_of_noise(scenario))
 
 
 def _design(scenario: Any, pole: float, eta: float, observer: float) -> Design:
     law, period = scenario.controller, scenario.loop.period
-    longest = 0.5 * (law.t_f + period)  # largest delta of a design [s]
-    eta = min(eta, max(0.5 + pole * longest, _least_eta(scenario)))
+    largest_delta = 0.5 * (law.t_f + period)  # [s]
+    eta = min(eta, max(0.5 + pole * largest_delta, _smallest_eta(scenario)))
     rate = min(observer * pole, 1.0 / period)
     position, velocity = scenario.devices.noise_of_error(scenario)
-    size, change = _disturbance(scenario)
+    disturbance, disturbance_rate = _disturbance_bounds(scenario)
     if velocity > 0.0:  # the noise of the estimate, l sigma_w, stays below half of the disturbance
-        rate = min(rate, max(0.5 * size / velocity, SLOWEST_OBSERVER / law.t_f))
+        rate = min(rate, max(0.5 * disturbance / velocity, MIN_OBSERVER_TIMES_T_F / law.t_f))
     # on three axes N K2 / 2 = 3 residual: the boundary layer adds a quarter to the gain p; it is thicker than the noise
-    residual = change / rate
+    residual = disturbance_rate / rate
     width = max(12.0 * residual / pole, 2.0 * math.hypot(velocity, pole * position)) or 1e-3 * pole
     return Design(eta, pole, rate * scenario.mean_inertia, width, scenario.reaching, scales(scenario).time)
 
 
-def _limits(scenario: Any) -> _Limits:
+def _pole_range(scenario: Any) -> _PoleRange:
     """Return the range of p, and the most accurate p in it.
 
     Dead time, flexible modes, and noise against the torque limit bound p from above. The most accurate p minimises the
@@ -194,61 +195,62 @@ def _limits(scenario: Any) -> _Limits:
     - sigma (h / p)^(1/2), from the rate noise.
     """
     t_f, period = scenario.controller.t_f, scenario.loop.period
-    least, most = SLOWEST / t_f, fastest_pole(scenario)
-    if most <= least:  # the larger of this limit and the p with delta = t_f / 2
-        slow = max(most, (2.0 * _least_eta(scenario) - 1.0) / t_f)
-        return _Limits(max(most, 0.1 * slow), slow, slow)
+    slowest, fastest = MIN_POLE_TIMES_T_F / t_f, fastest_pole(scenario)
+    if fastest <= slowest:  # the larger of this limit and the p with delta = t_f / 2
+        slow_pole = max(fastest, (2.0 * _smallest_eta(scenario) - 1.0) / t_f)
+        return _PoleRange(max(fastest, 0.1 * slow_pole), slow_pole, slow_pole)
     position, velocity = scenario.devices.noise_of_error(scenario)
     position = 0.0 if scenario.estimator.on else position  # an attitude filter passes slow errors only
     # descending, so that argmin returns the fastest of rates with equal errors
-    rates = least * (most / least) ** np.linspace(1.0, 0.0, TRIED)
+    rates = slowest * (fastest / slowest) ** np.linspace(1.0, 0.0, POLE_CANDIDATES)
     with np.errstate(all="ignore"):
-        lag = _disturbance(scenario)[1] / (OBSERVER * rates**3)
+        lag = _disturbance_bounds(scenario)[1] / (OBSERVER_TO_POLE * rates**3)
         error = lag**2 + position**2 * rates * period + velocity**2 * period / rates
-    return _Limits(least, float(rates[int(np.argmin(error))]), most)
+    return _PoleRange(slowest, float(rates[int(np.argmin(error))]), fastest)
 
 
-def _with_modes(scenario: Any) -> float:
+def _pole_limit_of_modes(scenario: Any) -> float:
     """Return the largest p [1/s] that keeps the resonance of every late mode 6 dB below 1.
 
     The loop gain at the resonance w of a mode is 2 p / w times k / (2 z). Here z is its damping, f its fraction of the
-    inertia, and k = f / (1 - f). A mode is late if w T exceeds `FASTEST_MODE`.
+    inertia, and k = f / (1 - f). A mode is late if w T exceeds `MAX_MODE_PHASE`.
     """
-    found = math.inf
+    largest_pole = math.inf
     for frequency, damping, fraction in scenario.modes():
-        if frequency * dead_time(scenario) > FASTEST_MODE and fraction > 0.0:
-            found = min(found, 0.5 * damping * frequency / fraction)
-    return found
+        if frequency * dead_time(scenario) > MAX_MODE_PHASE and fraction > 0.0:
+            largest_pole = min(largest_pole, 0.5 * damping * frequency / fraction)
+    return largest_pole
 
 
-def _with_noise(scenario: Any) -> float:
+def _pole_limit_of_noise(scenario: Any) -> float:
     """Return the largest p [1/s] at which noise uses at most `NOISE_FRACTION` of the torque limit.
 
     A noise sample (x, v) commands the acceleration (2 p + l / J) v + p^2 x of the error.
     """
     limit = scenario.largest_acceleration()
     position, velocity = scenario.devices.noise_of_error(scenario)
-    position *= scenario.estimator.passes(scenario)
+    position *= scenario.estimator.immediate_noise_fraction(scenario)
     if limit is None or not (position or velocity):
         return math.inf
-    allowed, square = NOISE_FRACTION * limit / SIGMAS, ((2.0 + OBSERVER) * velocity) ** 2
-    return math.sqrt(2.0 * allowed**2 / (square + math.sqrt(square**2 + 4.0 * (position * allowed) ** 2)))
+    allowed, velocity_square = NOISE_FRACTION * limit / NOISE_SIGMAS, ((2.0 + OBSERVER_TO_POLE) * velocity) ** 2
+    root = math.sqrt(velocity_square**2 + 4.0 * (position * allowed) ** 2)
+    return math.sqrt(2.0 * allowed**2 / (velocity_square + root))
 
 
-def _disturbance(scenario: Any) -> tuple[float, float]:
+def _disturbance_bounds(scenario: Any) -> tuple[float, float]:
     """Return the bounds on the disturbing acceleration of the error and on its rate, zeros if they are unknown."""
     law = scenario.controller
     return tuple((value or 0.0) * scenario.influence for value in (law.disturbance_bound, law.disturbance_rate_bound))
 
 
-def _least_eta(scenario: Any) -> float:
-    return scenario.least_eta + (LEAST_ETA - 2.0)
+def _smallest_eta(scenario: Any) -> float:
+    return scenario.least_eta + (SMALLEST_USEFUL_ETA - 2.0)
 
 
-def _eta(scenario: Any) -> float:
+def _default_eta(scenario: Any) -> float:
     """Return the published eta, or a smaller one if the first torque would exceed the limit."""
-    usual, limit, angle = scenario.least_eta + 1.0, scenario.largest_acceleration(), scenario.start_tangent()
+    published_eta, limit, angle = scenario.least_eta + 1.0, scenario.largest_acceleration(), scenario.start_tangent()
     if limit is None or angle == 0.0:
-        return usual
-    # the error's first acceleration is eta^2 tan(angle / 2) / t_f^2; a tenth of the limit is left for the rest
-    return min(usual, max(scenario.controller.t_f * math.sqrt(0.9 * limit / angle), _least_eta(scenario)))
+        return published_eta
+    # the error's first acceleration is eta^2 tan(angle / 2) / t_f^2; a tenth of the limit remains for other torques
+    return min(published_eta, max(scenario.controller.t_f * math.sqrt(0.9 * limit / angle), _smallest_eta(scenario)))

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from ptsmc_jax.scenario import epochs
-from ptsmc_jax.scenario.schema import PartTable, table
+from ptsmc_jax.scenario.schema import PartTable, make_table
 from ptsmc_jax.scenario.values import Kinds, Meaning, Number
 from ptsmc_jax.signals import orbits
 
@@ -22,12 +22,12 @@ class OrbitTable(PartTable, frozen=True):
         return orbits.mean_anomaly(self.true_anomaly, float(self.eccentricity))  # pyright: ignore
 
     def build(self, epoch: str | None) -> Any:
-        """Return the orbit with numbers of NumPy; epoch: `loop.epoch`."""
+        """Build the orbit with NumPy numbers; epoch: value of `loop.epoch`."""
         names = [field.name for field in dataclasses.fields(orbits.Orbit)]
         numbers = {name: getattr(self, name) for name in names}
         if numbers["earth_angle"] is None:
-            numbers["earth_angle"] = 0.0 if epoch is None else orbits.earth_angle(epochs.of_key(epoch).days)
-        return self.made(**{name: np.float64(value) for name, value in numbers.items()})
+            numbers["earth_angle"] = 0.0 if epoch is None else orbits.earth_angle(epochs.parse_key(epoch).days)
+        return self.part_class(**{name: np.float64(value) for name, value in numbers.items()})
 
 
-ORBITS: Kinds = {"kepler": table(OrbitTable, orbits.Orbit, "kepler")}
+ORBITS: Kinds = {"kepler": make_table(OrbitTable, orbits.Orbit, "kepler")}

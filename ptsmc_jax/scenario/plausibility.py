@@ -12,9 +12,11 @@ from ptsmc_jax.scenario import disturbance_bounds, errors
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.theory import stability_limits
 
-FAR = 10.0  # largest ratio of a stated bound to the bound of the disturbance, or its inverse, without a warning
-LATE = 0.1  # delay as a fraction of t_f; a longer one was probably given in seconds
-COARSE = np.deg2rad(5.0)  # noise [rad]; a larger one was probably given in another unit
+MAX_BOUND_RATIO = (
+    10.0  # largest ratio of a stated bound to the bound of the disturbance, or its inverse, without a warning
+)
+MAX_DELAY_FRACTION = 0.1  # delay as a fraction of t_f; a longer one was probably given in seconds
+MAX_ATTITUDE_NOISE = np.deg2rad(5.0)  # noise [rad]; a larger one was probably given in another unit
 
 
 def warnings(scenario: Scenario) -> list[str]:
@@ -23,12 +25,14 @@ def warnings(scenario: Scenario) -> list[str]:
     Bounds and estimate are not examined if custom code that defines the disturbance has not run yet.
     """
     bounds = disturbance_bounds.compute(scenario)
-    bounded = [] if bounds is None else [*_implausible_bound(scenario, *bounds), *_noisy_estimate(scenario, bounds[0])]
-    others = (_perfect_rate, _noise_in_wrong_unit, _delay_in_seconds, _fast_surface, _below_horizon)
-    return [*bounded, *(text for warn in others for text in warn(scenario))]
+    bound_warnings = (
+        [] if bounds is None else [*_implausible_bound(scenario, *bounds), *_noisy_estimate(scenario, bounds[0])]
+    )
+    checks = (_perfect_gyro, _noise_in_wrong_unit, _delay_in_seconds, _unstable_surface_rate, _target_below_horizon)
+    return [*bound_warnings, *(warning for check in checks for warning in check(scenario))]
 
 
-def _below_horizon(scenario: Scenario) -> list[str]:
+def _target_below_horizon(scenario: Scenario) -> list[str]:
     """Warn about a ground target that the Earth hides during the run."""
     reference: Any = getattr(scenario, "reference", None)
     if not hasattr(reference, "lowest_elevation"):
@@ -45,7 +49,7 @@ def _below_horizon(scenario: Scenario) -> list[str]:
 def _delay_in_seconds(scenario: Scenario) -> list[str]:
     """Warn about a delay that was probably given in seconds: the key counts control periods."""
     delay, period = scenario.devices.delay_periods, scenario.loop.period
-    if delay * period < LATE * scenario.controller.t_f:
+    if delay * period < MAX_DELAY_FRACTION * scenario.controller.t_f:
         return []
     return [
         f"hardware.delay is {delay} control periods of {period:g} s, together {delay * period:g} s; the key is not a "
@@ -53,7 +57,7 @@ def _delay_in_seconds(scenario: Scenario) -> list[str]:
     ]
 
 
-def _fast_surface(scenario: Scenario) -> list[str]:
+def _unstable_surface_rate(scenario: Scenario) -> list[str]:
     """Warn if no K1 stabilises the sampled hold phase at the scenario's surface rate c.
 
     The published c = 1 1/s assumes a control period that is short compared with 1 s.
@@ -66,9 +70,9 @@ def _fast_surface(scenario: Scenario) -> list[str]:
     stability_limit = stability_limits.largest_surface(delay, implicit=law.implicit) / (first_coefficient * period)
     if law.surface_rate < stability_limit:
         return []
-    late = f" and a delay of {delay}" if delay else ""
+    delayed = f" and a delay of {delay}" if delay else ""
     return [
-        f"controller.surface_rate is {law.surface_rate:g} 1/s: at a period of {period:g} s{late} no k1 stabilises "
+        f"controller.surface_rate is {law.surface_rate:g} 1/s: at a period of {period:g} s{delayed} no k1 stabilises "
         f"the hold phase; use a surface_rate below {stability_limit:.3g} 1/s, or add it to tune.free"
     ]
 
@@ -76,7 +80,7 @@ def _fast_surface(scenario: Scenario) -> list[str]:
 def _noise_in_wrong_unit(scenario: Scenario) -> list[str]:
     """Warn about a star tracker whose noise is larger than that of any real device."""
     noise = getattr(scenario.hardware, "attitude_noise", None)
-    if not noise or noise < COARSE:
+    if not noise or noise < MAX_ATTITUDE_NOISE:
         return []
     return [
         f"hardware.attitude_noise is {noise:g} rad, {np.rad2deg(noise):.3g} deg, which is very large; a number in "
@@ -84,52 +88,54 @@ def _noise_in_wrong_unit(scenario: Scenario) -> list[str]:
     ]
 
 
-def _perfect_rate(scenario: Scenario) -> list[str]:
+def _perfect_gyro(scenario: Scenario) -> list[str]:
     """Warn about a noisy star tracker with a gyro without errors: the law then knows the true rate."""
     device: Any = scenario.hardware
-    star = getattr(device, "attitude_noise", None)
-    gyro = ("rate_noise", "rate_noise_density", "rate_bias", "rate_bias_walk")
-    if not star or scenario.sensors is not None or any(getattr(device, name) is not None for name in gyro):
+    noise = getattr(device, "attitude_noise", None)
+    gyro_keys = ("rate_noise", "rate_noise_density", "rate_bias", "rate_bias_walk")
+    if not noise or scenario.sensors is not None or any(getattr(device, name) is not None for name in gyro_keys):
         return []
     return [
-        f"hardware.attitude_noise is {star:g}, but the gyro has no error: the law measures the true rate; "
+        f"hardware.attitude_noise is {noise:g}, but the gyro has no error: the law measures the true rate; "
         "set hardware.rate_noise or rate_noise_density, or rate_noise = 0 to confirm a perfect gyro"
     ]
 
 
-def _implausible_bound(scenario: Scenario, largest: float, fastest: float) -> list[str]:
-    """Warn about a stated bound that differs from the bound of the disturbance by more than the factor `FAR`.
+def _implausible_bound(scenario: Scenario, bound: float, rate_bound: float) -> list[str]:
+    """Warn about a stated bound that is more than `MAX_BOUND_RATIO` times too large or too small.
 
     Only the bound that the law uses is examined: K without an observer, c with an observer.
     """
     if not scenario.controller.law.switches:
         return []
-    name, follows = ("disturbance_rate_bound", fastest)
+    name, computed = ("disturbance_rate_bound", rate_bound)
     if scenario.observer.kind in ("none", "custom"):
-        name, follows = ("disturbance_bound", largest)
+        name, computed = ("disturbance_bound", bound)
     stated = getattr(scenario.controller, name)
-    if stated is None or max(stated, follows) <= FAR * min(stated, follows):
+    if stated is None or max(stated, computed) <= MAX_BOUND_RATIO * min(stated, computed):
         return []
-    what = f"controller.{name} is {stated:g}, but the disturbance of [disturbance] and [dispersion] has {follows:g}"
-    if stated > follows:
+    comparison = (
+        f"controller.{name} is {stated:g}, but the disturbance of [disturbance] and [dispersion] has {computed:g}"
+    )
+    if stated > computed:
         return [
-            f"{what}: the law switches more than necessary, and chatters; remove the key to use the bound of the "
+            f"{comparison}: the law switches more than necessary, and chatters; remove the key to use the bound of the "
             "disturbance"
         ]
-    return [f"{what}: the law may not reject it; remove the key to use the bound of the disturbance"]
+    return [f"{comparison}: the law may not reject it; remove the key to use the bound of the disturbance"]
 
 
-def _noisy_estimate(scenario: Scenario, largest: float) -> list[str]:
+def _noisy_estimate(scenario: Scenario, disturbance_bound: float) -> list[str]:
     """Warn about an observer whose estimate has more noise than the disturbance has amplitude."""
     noise = estimate_noise(scenario)
-    if not noise > largest > 0.0:
+    if not noise > disturbance_bound > 0.0:
         return []
     gain = scenario.observer.gain
     shown = errors.brief([float(f"{one:.4g}") for one in gain] if len(set(gain)) > 1 else float(f"{gain[0]:.4g}"))
     unit = " N m" if scenario.motion == "spacecraft" else ""
     return [
         f"observer.gain is {shown}: the noise of its estimate, {noise:.2g}{unit} (1 sigma), is larger than the "
-        f"disturbance, at most {largest:.3g}{unit}; try a smaller gain"
+        f"disturbance, at most {disturbance_bound:.3g}{unit}; try a smaller gain"
     ]
 
 
@@ -144,9 +150,9 @@ def estimate_noise(scenario: Scenario) -> float:
     gains, loop = getattr(scenario.observer, "gain", None), scenario.loop
     if scenario.observer.kind not in ("nonlinear", "prescribed_time") or gains is None or not scenario.sampled:
         return 0.0
-    known: Any = scenario
+    any_scenario: Any = scenario
     if scenario.motion == "spacecraft":
-        inertia = np.asarray(known.spacecraft.inertia, dtype=float)
+        inertia = np.asarray(any_scenario.spacecraft.inertia, dtype=float)
         moments = inertia if inertia.ndim == 1 else np.diag(inertia)
         sigmas = np.full(3, scenario.devices.gyro_noise(loop.period))
     else:
@@ -154,5 +160,5 @@ def estimate_noise(scenario: Scenario) -> float:
         if noise is None or scenario.plant.kind != "chain":  # the matrix M of a custom system is not known here
             return 0.0
         moments, sigmas = np.ones(1), np.asarray(noise[-1:])
-    left = np.exp(-np.asarray(gains) * loop.period / moments)
-    return float(np.max(moments * sigmas / loop.period * (1.0 - left) * np.sqrt(2.0 / (1.0 + left))))
+    decay = np.exp(-np.asarray(gains) * loop.period / moments)
+    return float(np.max(moments * sigmas / loop.period * (1.0 - decay) * np.sqrt(2.0 / (1.0 + decay))))

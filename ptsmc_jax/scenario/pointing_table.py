@@ -12,7 +12,7 @@ from ptsmc_jax.scenario.errors import wrong
 from ptsmc_jax.scenario.values import ABSENT, Meaning, NotNegative, ResolvedPositive, Table, Three
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.pointing import Pointing as PointingPart
-from ptsmc_jax.simulation.pointing import across
+from ptsmc_jax.simulation.pointing import boresight_frame
 
 LONGEST_STEP = 0.02  # largest step of the continuous loop in the hold phase / t_f, see `clock`
 
@@ -41,30 +41,32 @@ class Pointing(Table, frozen=True):
         """
         if not np.linalg.norm(self.boresight) > 0.0:
             raise wrong("pointing.boresight", self.boresight, "a direction, not all zero")
-        left, needed = scenario.end - scenario.controller.t_f, 2.0 * self.window * (1 - 1e-9)
-        if not left >= needed:
-            raise wrong("pointing.window", self.window, f"at most half of loop.t_end - controller.t_f, {left:.6g}")
-        if not left - self.after >= needed:
-            latest = f"at most {left - 2.0 * self.window:.6g}, two windows of {self.window:g} s before loop.t_end"
+        available, needed = scenario.end - scenario.controller.t_f, 2.0 * self.window * (1 - 1e-9)
+        if not available >= needed:
+            raise wrong("pointing.window", self.window, f"at most half of loop.t_end - controller.t_f, {available:.6g}")
+        if not available - self.after >= needed:
+            latest = f"at most {available - 2.0 * self.window:.6g}, two windows of {self.window:g} s before loop.t_end"
             raise wrong("pointing.after", self.after, latest)
         sampled = scenario.sampled
-        longest = LONGEST_STEP * scenario.controller.t_f
-        least, what = (scenario.loop.period, "loop.period") if sampled else (longest, "the longest step")
+        longest_step = LONGEST_STEP * scenario.controller.t_f
+        shortest, source = (scenario.loop.period, "loop.period") if sampled else (longest_step, "the longest step")
         jitter = getattr(scenario.dispersion, "timing_jitter", None)
         if sampled and jitter is not None:  # a period may begin early and end late
-            least, what = least * (1.0 + 2.0 * jitter.largest), "the longest control period with its jitter"
-        if self.window < least * (1 - 1e-9):
-            raise wrong("pointing.window", self.window, f"at least {what}, {least:.9g}")
+            shortest, source = shortest * (1.0 + 2.0 * jitter.largest), "the longest control period with its jitter"
+        if self.window < shortest * (1 - 1e-9):
+            raise wrong("pointing.window", self.window, f"at least {source}, {shortest:.9g}")
 
     def build(self, scenario: Any) -> Any:
         """Return `pointing.Pointing`, with the limits whose requirements concern a fraction of the time."""
-        timed = {
+        limits = {
             name: vector(limit.limit)
             for name, limit in scenario.requirements.items()
             if getattr(limit, "interpretation", None) not in (None, "ensemble")
         }
         # if no limit needs the samples, their number is 0 for every period, so that one program serves all periods
-        kept = scenario.sampled and any(name.startswith(catalogues.RELATIVE) for name in timed)
+        needs_samples = scenario.sampled and any(name.startswith(catalogues.RELATIVE_INDICES) for name in limits)
         # both ends of a window may be samples, and jitter of half a period may move one more sample into it
-        samples = math.ceil(self.window / scenario.loop.period) + 2 if kept else 0
-        return PointingPart(vector(across(self.boresight)), vector(self.after), vector(self.window), timed, samples)
+        samples = math.ceil(self.window / scenario.loop.period) + 2 if needs_samples else 0
+        return PointingPart(
+            vector(boresight_frame(self.boresight)), vector(self.after), vector(self.window), limits, samples
+        )

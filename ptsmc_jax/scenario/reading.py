@@ -12,7 +12,7 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario, check_scenario
 from ptsmc_jax.scenario.values import Table
 
-AFTER = Scaled(10.0, time=1)  # default time from t_f to the end of a run [s]
+TIME_AFTER_T_F = Scaled(10.0, time=1)  # default time from t_f to the end of a run [s]
 
 
 def read(path: str | Path) -> Scenario:
@@ -20,11 +20,11 @@ def read(path: str | Path) -> Scenario:
     return from_tables(parsing.load(path))
 
 
-def to_scenario(what: object) -> Scenario:
-    """Return a scenario, or read it if `what` is the path of a file; raise TypeError for anything else."""
-    if isinstance(what, str | Path):
-        return read(what)
-    return check_scenario(what, ", or its file")
+def to_scenario(scenario_or_path: object) -> Scenario:
+    """Return a scenario, or read it if `scenario_or_path` is the path of a file; raise TypeError for anything else."""
+    if isinstance(scenario_or_path, str | Path):
+        return read(scenario_or_path)
+    return check_scenario(scenario_or_path, ", or its file")
 
 
 def from_tables(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
@@ -39,21 +39,21 @@ def from_tables(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
         TypeError: `raw` is not a mapping.
     """
     if not isinstance(raw, Mapping):
-        found = f"this is a {type(raw).__name__}"
-        raise TypeError(f'tables are needed, such as {{"controller": {{"t_f": 35.0}}}}, but {found}')
+        actual = f"this is a {type(raw).__name__}"
+        raise TypeError(f'tables are needed, such as {{"controller": {{"t_f": 35.0}}}}, but {actual}')
     try:
-        return _checked(raw, run)
+        return _validate(raw, run)
     except ScenarioError as error:
-        raise parsing.as_written(error, raw) from None
+        raise parsing.quote_as_written(error, raw) from None
 
 
-def _checked(raw: Mapping[str, Any], run: bool) -> Scenario:
+def _validate(raw: Mapping[str, Any], run: bool) -> Scenario:
     """Return the scenario of raw tables, with the defaults that depend on other keys."""
     scenario = resolve(parsing.parse(raw, run=run))
-    checks.check(scenario)
-    if scenario.tune is not None and not custom.waits(scenario):
+    checks.check_keys(scenario)
+    if scenario.tune is not None and not custom.has_unloaded_code(scenario):
         scenario = msgspec.structs.replace(scenario, tune=free_gains.resolve(scenario, scenario.tune))
-    return msgspec.structs.replace(scenario, defaulted=parsing.unstated(raw, parsing.dump(scenario)))
+    return msgspec.structs.replace(scenario, defaulted=parsing.unstated_values(raw, parsing.dump(scenario)))
 
 
 def resolve(scenario: Scenario) -> Scenario:
@@ -63,26 +63,26 @@ def resolve(scenario: Scenario) -> Scenario:
         ScenarioError: the inertia, which determines defaults, is not that of a body, or devices contradict each other.
     """
     scenario.check_body()
-    units, law = mission.scales(scenario), scenario.controller
-    filled = {
-        name: mission.with_defaults(getattr(scenario, name), units)
+    ratios, law = mission.scales(scenario), scenario.controller
+    tables = {
+        name: mission.fill_scaled_defaults(getattr(scenario, name), ratios)
         for name in scenario.__struct_fields__
         if isinstance(getattr(scenario, name), Table) and name not in ("controller", "observer", "tune")
     }
-    loop = filled["loop"]
+    loop = tables["loop"]
     if scenario.loop.window is None and scenario.sampled:
         loop = msgspec.structs.replace(loop, window=max(loop.window, loop.period))
     if loop.t_end is None:
-        loop = msgspec.structs.replace(loop, t_end=law.t_f + max(units.of(AFTER), loop.window))
-    scenario = msgspec.structs.replace(scenario, **{**filled, "loop": loop})
+        loop = msgspec.structs.replace(loop, t_end=law.t_f + max(ratios.scaled_value(TIME_AFTER_T_F), loop.window))
+    scenario = msgspec.structs.replace(scenario, **{**tables, "loop": loop})
     checks.check_sensors(scenario)
     scenario.check_devices()
     if loop.settling_angle is None:
-        loop = msgspec.structs.replace(loop, settling_angle=scenario.usual_settling())
+        loop = msgspec.structs.replace(loop, settling_angle=scenario.default_settling_angle())
         scenario = msgspec.structs.replace(scenario, loop=loop)
-    scenario = msgspec.structs.replace(scenario, controller=law.filled(scenario))
-    observer = mission.with_defaults(scenario.observer.filled(scenario), units)
-    return msgspec.structs.replace(scenario, observer=observer).resolved()
+    scenario = msgspec.structs.replace(scenario, controller=law.fill_defaults(scenario))
+    observer = mission.fill_scaled_defaults(scenario.observer.fill_defaults(scenario), ratios)
+    return msgspec.structs.replace(scenario, observer=observer).fill_plant_defaults()
 
 
 def complete(scenario: Scenario) -> Scenario:
@@ -91,10 +91,10 @@ def complete(scenario: Scenario) -> Scenario:
     Raises:
         ScenarioError: the code fails, or a key is not valid.
     """
-    return from_tables(parsing.stated(scenario), run=True) if custom.waits(scenario) else scenario
+    return from_tables(parsing.stated_tables(scenario), run=True) if custom.has_unloaded_code(scenario) else scenario
 
 
-def settled(scenario: Scenario) -> Scenario:
+def freeze_defaults(scenario: Scenario) -> Scenario:
     """Return a scenario whose defaults count as stated values, so that `replace` does not change them."""
     return msgspec.structs.replace(scenario, defaulted={})
 
@@ -121,29 +121,29 @@ def replace(scenario: Scenario | str | Path, **changes: Any) -> Scenario:
     ptsmc_jax.scenario.errors.ScenarioError: controller.eta is 1.0, but must be a number greater than 2 (Theorem 2)
     """
     scenario = to_scenario(scenario)
-    tables = parsing.stated(scenario)
-    for name in sorted(changes, key=_comes):
+    tables = parsing.stated_tables(scenario)
+    for name in sorted(changes, key=_change_order):
         value, (table, _, key) = changes[name], name.partition("__")
-        within = tables.get(table, {})
-        if key and not isinstance(within, Mapping):
+        present = tables.get(table, {})
+        if key and not isinstance(present, Mapping):
             continue  # `from_tables` reports a table that is not a mapping
         if value is None and _is_known(scenario, table, key):
             if not key:
                 tables.pop(table, None)
             elif key == "kind" and _is_another_kind(scenario, table):
                 tables[table] = {}
-            elif key in within:  # in a copy: the table may belong to the caller
-                tables[table] = {other: kept for other, kept in within.items() if other != key}
+            elif key in present:  # in a copy: the table may belong to the caller
+                tables[table] = {other: kept for other, kept in present.items() if other != key}
         elif not key:
-            tables[table] = parsing.plain(value) if isinstance(value, Table) else value
+            tables[table] = parsing.to_dict(value) if isinstance(value, Table) else value
         elif key == "kind" and getattr(getattr(scenario, table, None), "kind", None) != value:
             tables[table] = {"kind": value}
         else:
-            tables[table] = {**within, key: value}
-    return from_tables(tables, run=not custom.waits(scenario))
+            tables[table] = {**present, key: value}
+    return from_tables(tables, run=not custom.has_unloaded_code(scenario))
 
 
-def _comes(name: str) -> int:
+def _change_order(name: str) -> int:
     """Return the order of a change: whole tables, then kinds, then other keys, which these would discard."""
     _, _, key = name.partition("__")
     return 0 if not key else 1 if key == "kind" else 2
@@ -159,7 +159,7 @@ def _is_another_kind(scenario: Scenario, table: str) -> bool:
 def _is_known(scenario: Scenario, table: str, key: str) -> bool:
     """Whether a table or key exists; `from_tables` reports an unknown one."""
     tables = set(scenario.__struct_fields__) - {"defaulted"}
-    now = getattr(scenario, table) if table in tables else None
-    if not key or now is None:
+    present = getattr(scenario, table) if table in tables else None
+    if not key or present is None:
         return table in tables
-    return key in now.__struct_fields__ if isinstance(now, msgspec.Struct) else True
+    return key in present.__struct_fields__ if isinstance(present, msgspec.Struct) else True

@@ -12,10 +12,10 @@ from msgspec import Meta
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.scenario import attitude_files, attitude_keys, missions
 from ptsmc_jax.scenario.attitude_keys import Attitude
-from ptsmc_jax.scenario.custom import Custom, custom_kind, fastest
-from ptsmc_jax.scenario.errors import ScenarioError, refused, show, wrong
+from ptsmc_jax.scenario.custom import Custom, custom_kind, fastest_rate
+from ptsmc_jax.scenario.errors import ScenarioError, show, value_error, wrong
 from ptsmc_jax.scenario.missions import DIRECTIONS, Vector
-from ptsmc_jax.scenario.schema import PartTable, table
+from ptsmc_jax.scenario.schema import PartTable, make_table
 from ptsmc_jax.scenario.values import Four, Kinds, Meaning, Number, Three
 from ptsmc_jax.signals import attitude_tables, mission_references, orbits, references
 
@@ -45,7 +45,7 @@ class ReferenceTable(PartTable, frozen=True):
         """Return the part of `signals`."""
         raise NotImplementedError
 
-    def first(self, scenario: Any) -> np.ndarray:
+    def initial_attitude(self, scenario: Any) -> np.ndarray:
         """Return the unit quaternion (4,) of the reference at t = 0."""
         raise NotImplementedError
 
@@ -55,15 +55,15 @@ class AttitudeReference(Attitude, ReferenceTable, frozen=True):
 
     def frequencies(self, scenario: Any) -> dict[str, float]:
         part = self.build(scenario) if isinstance(self, Custom) else self
-        return {f"reference.{self.made.paced_by}": fastest(self, "reference", part)}
+        return {f"reference.{self.part_class.paced_by}": fastest_rate(self, "reference", part)}
 
     def check(self, scenario: Any) -> None:
-        self.first(scenario)
+        self.initial_attitude(scenario)
 
     def build(self, scenario: Any) -> Any:
-        return self.part(q=vector(self.first(scenario)))
+        return self.part(q=vector(self.initial_attitude(scenario)))
 
-    def first(self, scenario: Any) -> np.ndarray:
+    def initial_attitude(self, scenario: Any) -> np.ndarray:
         return attitude_keys.quaternion(self, "reference")
 
 
@@ -84,14 +84,14 @@ class SlewTable(AttitudeReference, frozen=True):
         from scipy.spatial.transform import Rotation
 
         start = Rotation.from_quat(attitude_keys.quaternion(self, "reference"))
-        end = Rotation.from_quat(attitude_keys.unit("reference.to_quat_xyzw", self.to_quat_xyzw))
+        end = Rotation.from_quat(attitude_keys.unit_quaternion("reference.to_quat_xyzw", self.to_quat_xyzw))
         short = (start.inv() * end).as_rotvec()
         angle = np.linalg.norm(short)
         return short * (1.0 - 2.0 * np.pi / angle) if self.way == "long" and angle > 0.0 else short
 
     def check(self, scenario: Any) -> None:
         super().check(scenario)
-        attitude_keys.unit("reference.to_quat_xyzw", self.to_quat_xyzw)
+        attitude_keys.unit_quaternion("reference.to_quat_xyzw", self.to_quat_xyzw)
 
 
 class FileReference(ReferenceTable, frozen=True):
@@ -121,32 +121,32 @@ class FileReference(ReferenceTable, frozen=True):
             return attitude_files.read(self.file, self.quaternion_order, self.direction, self.interpolation,
                                        scenario.loop.epoch)  # fmt: skip
         except ValueError as error:
-            raise refused("reference.file", self.file, f", {error}") from None
+            raise value_error("reference.file", self.file, f", {error}") from None
 
     def frequencies(self, scenario: Any) -> dict[str, float]:
         return {"reference.file": self._samples(scenario).fastest}
 
     def check(self, scenario: Any) -> None:
         samples = self._samples(scenario)
-        begin, end = samples.times[0], samples.usable_until
-        if begin > 0.0 or end < 0.0:
+        first, last = samples.times[0], samples.usable_until
+        if first > 0.0 or last < 0.0:
             zero = "t = 0" if scenario.loop.epoch is None else f"loop.epoch = {show(scenario.loop.epoch)}"
-            raise refused("reference.file", self.file, f", whose attitudes are from {begin:.9g} to {end:.9g} s after "
-                          f"{zero}, which must be in between")  # fmt: skip
+            raise value_error("reference.file", self.file, f", whose attitudes are from {first:.9g} to {last:.9g} s "
+                              f"after {zero}, which must be in between")  # fmt: skip
         self.check_reference_until(scenario, scenario.end, "loop.t_end")
 
     def check_reference_until(self, scenario: Any, last: float, key: str) -> None:
         end = self._samples(scenario).usable_until
         if last > end * (1.0 + 1e-9):
-            stated = scenario.loop.t_end if key == "loop.t_end" else scenario.search.bounds.get("t_f")
-            raise refused(key, stated, f", which needs the attitude until {last:.12g} s, but {self.file} ends at "
+            value = scenario.loop.t_end if key == "loop.t_end" else scenario.search.bounds.get("t_f")
+            raise value_error(key, value, f", which needs the attitude until {last:.12g} s, but {self.file} ends at "
                           f"{end:.12g} s")  # fmt: skip
 
     def build(self, scenario: Any) -> Any:
         samples = self._samples(scenario)
-        return attitude_tables.interpolated(samples.times, samples.quaternions, samples.ends)
+        return attitude_tables.interpolate_attitude(samples.times, samples.quaternions, samples.end_rates)
 
-    def first(self, scenario: Any) -> np.ndarray:
+    def initial_attitude(self, scenario: Any) -> np.ndarray:
         self.check(scenario)
         samples = self._samples(scenario)
         k = int(np.argmin(np.abs(samples.times)))  # the nearest sample is accurate enough for a default
@@ -175,7 +175,7 @@ class NadirTable(MissionTable, frozen=True):
     """Local vertical, local horizontal."""
 
     def _orbit(self, scenario: Any) -> Any:
-        return missions.orbit(missions.build(scenario), 'reference.kind is "nadir"')
+        return missions.require_orbit(missions.from_scenario(scenario), 'reference.kind is "nadir"')
 
     def frequencies(self, scenario: Any) -> dict[str, float]:
         return {"reference.kind": float(self._orbit(scenario).fastest())}
@@ -189,13 +189,13 @@ class NadirTable(MissionTable, frozen=True):
         return mission_references.nadir_mounting(self.primary_axis, self.secondary_axis)
 
     def build(self, scenario: Any) -> Any:
-        part = self.made(q=missions.IDENTITY, mount=self.mount, orbit=self._orbit(scenario))
+        part = self.part_class(q=missions.IDENTITY, mount=self.mount, orbit=self._orbit(scenario))
         return jax.tree.map(vector, part)
 
-    def first(self, scenario: Any) -> np.ndarray:
+    def initial_attitude(self, scenario: Any) -> np.ndarray:
         self.check(scenario)
-        place = self._orbit(scenario)(np.zeros(()), np)
-        return missions.turned(np.stack([place.radial, place.along, place.normal], axis=1), self.mount)
+        axes = self._orbit(scenario)(np.zeros(()), np)
+        return missions.mounted_quaternion(np.stack([axes.radial, axes.along, axes.normal], axis=1), self.mount)
 
 
 class DirectionsTable(MissionTable, frozen=True):
@@ -206,18 +206,20 @@ class DirectionsTable(MissionTable, frozen=True):
         raise NotImplementedError
 
     def frequencies(self, scenario: Any) -> dict[str, float]:
-        return {"reference.kind": missions.along(self, missions.build(scenario)).fastest}
+        return {"reference.kind": missions.sample_reference(self, missions.from_scenario(scenario)).fastest}
 
     def check(self, scenario: Any) -> None:
         super().check(scenario)
-        missions.along(self, missions.build(scenario))
+        missions.sample_reference(self, missions.from_scenario(scenario))
 
     def build(self, scenario: Any) -> Any:
-        return missions.anchored(self, missions.build(scenario))
+        return missions.build_reference(self, missions.from_scenario(scenario))
 
-    def first(self, scenario: Any) -> np.ndarray:
+    def initial_attitude(self, scenario: Any) -> np.ndarray:
         self.check(scenario)
-        return missions.turned(missions.along(self, missions.build(scenario)).matrix, self.mount)
+        return missions.mounted_quaternion(
+            missions.sample_reference(self, missions.from_scenario(scenario)).matrix, self.mount
+        )
 
 
 SECONDARY = Meaning("direction of `secondary_axis`: a name, or three numbers in inertial axes")
@@ -238,11 +240,11 @@ class GroundTargetTable(DirectionsTable, frozen=True):
 
     def lowest_elevation(self, scenario: Any) -> tuple[float, float]:
         """Return the lowest elevation above the horizon of the target [rad], and its time [s]."""
-        return missions.lowest_elevation(self, missions.build(scenario))
+        return missions.lowest_elevation(self, missions.from_scenario(scenario))
 
     def directions(self, mission: missions.Mission) -> tuple[Any, Any]:
         point = orbits.ground_point(self.latitude, self.longitude, self.height)
-        return orbits.GroundPoint(point), missions.direction("reference.secondary", self.secondary, mission)
+        return orbits.GroundPoint(point), missions.build_direction("reference.secondary", self.secondary, mission)
 
 
 class TwoVectorTable(DirectionsTable, frozen=True):
@@ -252,21 +254,21 @@ class TwoVectorTable(DirectionsTable, frozen=True):
     secondary: Annotated[Vector, SECONDARY] = (0.0, 0.0, 1.0)
 
     def directions(self, mission: missions.Mission) -> tuple[Any, Any]:
-        named = ("reference.primary", self.primary), ("reference.secondary", self.secondary)
-        primary, secondary = (missions.direction(*each, mission) for each in named)
+        key_values = ("reference.primary", self.primary), ("reference.secondary", self.secondary)
+        primary, secondary = (missions.build_direction(*each, mission) for each in key_values)
         return primary, secondary
 
 
 # by kind, the default first
 REFERENCES: Kinds = {
-    "fixed": table(AttitudeReference, references.Fixed, "fixed"),
-    "spin": table(AttitudeReference, references.Spin, "spin"),
-    "sinusoid": table(AttitudeReference, references.Swing, "sinusoid"),
-    "slew": table(SlewTable, references.Slew, "slew"),
-    "table": table(FileReference, attitude_tables.TableReference, "table"),
-    "nadir": table(NadirTable, mission_references.NadirReference, "nadir"),
-    "ground_target": table(GroundTargetTable, mission_references.GroundTargetReference, "ground_target"),
-    "two_vector": table(TwoVectorTable, mission_references.TwoVectorReference, "two_vector"),
+    "fixed": make_table(AttitudeReference, references.Fixed, "fixed"),
+    "spin": make_table(AttitudeReference, references.Spin, "spin"),
+    "sinusoid": make_table(AttitudeReference, references.Swing, "sinusoid"),
+    "slew": make_table(SlewTable, references.Slew, "slew"),
+    "table": make_table(FileReference, attitude_tables.TableReference, "table"),
+    "nadir": make_table(NadirTable, mission_references.NadirReference, "nadir"),
+    "ground_target": make_table(GroundTargetTable, mission_references.GroundTargetReference, "ground_target"),
+    "two_vector": make_table(TwoVectorTable, mission_references.TwoVectorReference, "two_vector"),
     "custom": custom_kind(
         AttitudeReference, references.Reference, ("attitude",),
         "A custom reference, a class derived from ptsmc_jax.Reference; its fields are further keys.",

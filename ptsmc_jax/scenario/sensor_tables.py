@@ -16,12 +16,12 @@ from ptsmc_jax import formulas
 from ptsmc_jax.devices import attitude_sensors, kalman_filter, sensor_suite
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.scenario.custom import custom_kind
-from ptsmc_jax.scenario.device_tables import SAME, FilterTable, Hardware
+from ptsmc_jax.scenario.device_tables import WHOLE_TOLERANCE, FilterTable, Hardware
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.schema import PartTable
 from ptsmc_jax.scenario.values import Kinds, Meaning, NotNegative, Positive, Table, Three
 
-LATEST = 8  # control periods until a reading is used; the filter keeps an attitude for each
+MAX_LATENCY_PERIODS = 8  # control periods until a reading is used; the filter keeps an attitude for each
 Size = Annotated[float, Meta(ge=1e-15, le=1e3, description="a number from 1e-15 to 1000")]
 Sizes = Annotated[
     tuple[Size, ...],
@@ -37,13 +37,13 @@ class SensorTable(PartTable, frozen=True):
     required: ClassVar[tuple[str, ...]] = ()  # keys without a default
 
     def check_alone(self, place: str) -> None:
-        """Raise ScenarioError if a key is missing or keys contradict each other; place: of the table, for errors."""
+        """Raise ScenarioError if a key is missing or keys contradict each other; place: place in the file."""
         for key in self.required:
             if getattr(self, key) is None:
                 raise ScenarioError(f"{place}.{key} is absent, but must be given")
 
     def check(self, place: str, scenario: Any) -> None:
-        """Raise ScenarioError if keys contradict other tables of the scenario; place: of the table, for errors."""
+        """Raise ScenarioError if keys contradict other tables of the scenario; place: place in the file."""
 
 
 class AttitudeSensorTable(SensorTable, frozen=True):
@@ -67,13 +67,16 @@ class AttitudeSensorTable(SensorTable, frozen=True):
 
     def check(self, place: str, scenario: Any) -> None:
         """Raise ScenarioError for a sensor that is faster than the loop, slower than the run, or very late."""
-        control = scenario.loop.period
-        if self.period is not None and self.period < control * (1.0 - SAME):
-            raise wrong(f"{place}.period", self.period, f"at least loop.period, {control}")
+        control_period = scenario.loop.period
+        if self.period is not None and self.period < control_period * (1.0 - WHOLE_TOLERANCE):
+            raise wrong(f"{place}.period", self.period, f"at least loop.period, {control_period}")
         if self.period is not None and self.period > scenario.end:
             raise wrong(f"{place}.period", self.period, f"at most loop.t_end, {scenario.end}")
-        if self.latency > LATEST * control:
-            raise wrong(f"{place}.latency", self.latency, f"at most {LATEST} control periods, {LATEST * control:.6g} s")
+        latest = MAX_LATENCY_PERIODS * control_period
+        if self.latency > latest:
+            raise wrong(
+                f"{place}.latency", self.latency, f"at most {MAX_LATENCY_PERIODS} control periods, {latest:.6g} s"
+            )
 
     def mounting(self) -> np.ndarray:
         """Return the unit quaternion (4,) of the rotation from body axes to sensor axes."""
@@ -82,14 +85,14 @@ class AttitudeSensorTable(SensorTable, frozen=True):
         if self.rotvec_deg is not None:
             return Rotation.from_rotvec(np.array(self.rotvec_deg), degrees=True).as_quat(canonical=True)
         z = np.array(self.boresight or (0.0, 0.0, 1.0), dtype=float)
-        x, y, along = z / np.linalg.norm(z)
-        if along < -1.0 + 1e-12:
+        x, y, cosine = z / np.linalg.norm(z)
+        if cosine < -1.0 + 1e-12:
             return np.array([1.0, 0.0, 0.0, 0.0])
-        turn = np.array([-y, x, 0.0, 1.0 + along])  # the shortest rotation of the z axis
-        return turn / np.linalg.norm(turn)
+        quaternion = np.array([-y, x, 0.0, 1.0 + cosine])  # the shortest rotation of the z axis
+        return quaternion / np.linalg.norm(quaternion)
 
     def interval(self, period: float) -> float:
-        """Return the time between readings [s]; period: of control [s]."""
+        """Return the time between readings [s]; period: control period [s]."""
         return period if self.period is None else self.period
 
     def sigmas(self) -> tuple[float, ...]:
@@ -101,11 +104,11 @@ class AttitudeSensorTable(SensorTable, frozen=True):
         raise NotImplementedError
 
     def build(self, name: str, period: float) -> Any:
-        """Return the part of `devices.attitude_sensors`; name: of the sensor, period: of control [s]."""
+        """Return the part of `devices.attitude_sensors`; name: its name, period: control period [s]."""
         raise NotImplementedError
 
-    def common(self, name: str, period: float) -> dict[str, Any]:
-        """Return the fields that all attitude sensors share; name: of the sensor, period: of control [s]."""
+    def common_fields(self, name: str, period: float) -> dict[str, Any]:
+        """Return the fields that all attitude sensors share; name: its name, period: control period [s]."""
         return {
             "name": name,
             "noise": vector(self.sigmas()),
@@ -138,7 +141,7 @@ class StarTracker(AttitudeSensorTable, frozen=True):
 
     def build(self, name: str, period: float) -> Any:
         """Return `attitude_sensors.StarTracker`."""
-        return attitude_sensors.StarTracker(**self.common(name, period))
+        return attitude_sensors.StarTracker(**self.common_fields(name, period))
 
 
 class VectorSensor(AttitudeSensorTable, frozen=True):
@@ -160,17 +163,17 @@ class VectorSensor(AttitudeSensorTable, frozen=True):
 
     def information(self) -> np.ndarray:
         """Return the Fisher information (3, 3) of a reading [1/rad^2], if body axes and inertial axes coincide."""
-        return (np.eye(3) - np.outer(self.along, self.along)) / self.sigmas()[0] ** 2
+        return (np.eye(3) - np.outer(self.unit_direction, self.unit_direction)) / self.sigmas()[0] ** 2
 
     @property
-    def along(self) -> np.ndarray:
+    def unit_direction(self) -> np.ndarray:
         """Return the direction as a unit vector (3,)."""
         direction = np.array(self.direction, dtype=float)
         return direction / np.linalg.norm(direction)
 
     def build(self, name: str, period: float) -> Any:
         """Return `attitude_sensors.VectorSensor`."""
-        return attitude_sensors.VectorSensor(**self.common(name, period), direction=vector(self.along))
+        return attitude_sensors.VectorSensor(**self.common_fields(name, period), direction=vector(self.unit_direction))
 
 
 class CustomTable(AttitudeSensorTable, frozen=True):
@@ -188,19 +191,19 @@ class CustomTable(AttitudeSensorTable, frozen=True):
 
         Before the code has run, the sensor counts as a sensor of the whole attitude.
         """
-        if self.made is None:
+        if self.part_class is None:
             return np.eye(3) / max(self.sigmas(), default=1.0) ** 2
         rows = np.asarray(self.build("custom", 1.0).sensitivity(jnp.array([0.0, 0.0, 0.0, 1.0])))
         return rows.T @ (rows / np.array(self.sigmas())[:, None] ** 2)
 
     def build(self, name: str, period: float) -> Any:
         """Return the sensor; raise ScenarioError if the numbers of noises and of components of a reading differ."""
-        made = self.part(**self.common(name, period))
-        reading = made.read(jnp.array([0.0, 0.0, 0.0, 1.0]))
-        components = np.size(made.change(reading, reading))
-        if components != len(self.sigmas()):
-            raise wrong("sensors.noise", self.noise, f"a list of {components} numbers, one for each component")
-        return made
+        sensor = self.part(**self.common_fields(name, period))
+        reading = sensor.read(jnp.array([0.0, 0.0, 0.0, 1.0]))
+        component_count = np.size(sensor.change(reading, reading))
+        if component_count != len(self.sigmas()):
+            raise wrong("sensors.noise", self.noise, f"a list of {component_count} numbers, one for each component")
+        return sensor
 
 
 class Gyro(SensorTable, frozen=True):
@@ -227,8 +230,8 @@ class Gyro(SensorTable, frozen=True):
             raise wrong(f"{place}.rate_noise_density", self.rate_noise_density, "absent if rate_noise is given")
 
     def noise(self, period: float) -> float:
-        """Return the noise of a sample [rad/s]; period: of control [s]."""
-        return self.rate_noise or formulas.per_sample(self.rate_noise_density or 0.0, period)
+        """Return the noise of a sample [rad/s]; period: control period [s]."""
+        return self.rate_noise or formulas.noise_per_sample(self.rate_noise_density or 0.0, period)
 
 
 SENSORS: Kinds = {
@@ -247,11 +250,13 @@ class KalmanFilter(FilterTable, frozen=True):
 
     kind: Literal["kalman"] = "kalman"
 
-    def passes(self, scenario: Any) -> float:
+    def immediate_noise_fraction(self, scenario: Any) -> float:
         """Return approximately the fraction of a reading's noise that reaches the law at once."""
-        table, period = scenario.devices, scenario.loop.period
-        width = formulas.best_bandwidth(table.attitude_noise, table.gyro_noise(period), period, table.interval(period))
-        return -math.expm1(-2.0 * width * table.interval(period))
+        hardware, period = scenario.devices, scenario.loop.period
+        bandwidth = formulas.best_bandwidth(
+            hardware.attitude_noise, hardware.gyro_noise(period), period, hardware.interval(period)
+        )
+        return -math.expm1(-2.0 * bandwidth * hardware.interval(period))
 
 
 class SensorSuite(Table, frozen=True):
@@ -260,8 +265,8 @@ class SensorSuite(Table, frozen=True):
     each: tuple[Any, ...]
     gains: ClassVar[Mapping[str, Any]] = {}
 
-    def placed(self, name: str) -> dict[str, SensorTable]:
-        """Return the tables by their place in a file, such as sensors[0]; name: of the list in the file."""
+    def tables_by_name(self, name: str) -> dict[str, SensorTable]:
+        """Return the tables by their place in a file, such as sensors[0]; name: key of the list."""
         return {f"{name}[{k}]": table for k, table in enumerate(self.each)}
 
     @property
@@ -272,24 +277,25 @@ class SensorSuite(Table, frozen=True):
     @property
     def attitude(self) -> dict[str, AttitudeSensorTable]:
         """Return the attitude sensors by name, such as star_tracker_1; exported C uses the same names for inputs."""
-        found, counts = dict[str, Any](), dict[str, int]()
+        sensors, counts = dict[str, Any](), dict[str, int]()
         for table in self.each:
             kind = table.kind
             counts[kind] = counts.get(kind, 0) + 1
             if isinstance(table, AttitudeSensorTable):
-                found[f"{kind}_{counts[kind]}"] = table
-        return found
+                sensors[f"{kind}_{counts[kind]}"] = table
+        return sensors
 
     def check_alone(self) -> None:
         """Raise ScenarioError if a sensor is not valid or if the sensors together do not determine the attitude."""
-        for place, table in self.placed("sensors").items():
+        for place, table in self.tables_by_name("sensors").items():
             table.check_alone(place)
         if not self.gyros:
             raise ScenarioError(
                 "[[sensors]] has no gyro, but must have one: the filter propagates the attitude with gyro readings"
             )
-        values = np.linalg.eigvalsh(sum((table.information() for table in self.attitude.values()), np.zeros((3, 3))))
-        if not values[0] > 1e-9 * values[-1]:
+        information = sum((table.information() for table in self.attitude.values()), np.zeros((3, 3)))
+        eigenvalues = np.linalg.eigvalsh(information)
+        if not eigenvalues[0] > 1e-9 * eigenvalues[-1]:
             raise ScenarioError(
                 "[[sensors]] does not determine the attitude, but must have a star tracker, or two vector sensors with "
                 "different directions"
@@ -297,18 +303,18 @@ class SensorSuite(Table, frozen=True):
 
     def check(self, scenario: Any) -> None:
         """Raise ScenarioError if keys contradict other tables of the scenario."""
-        for place, table in self.placed("sensors").items():
+        for place, table in self.tables_by_name("sensors").items():
             table.check(place, scenario)
 
-    def gyro(self, period: float) -> tuple[float, float, float]:
+    def mean_gyro(self, period: float) -> tuple[float, float, float]:
         """Return noise [rad/s], bias [rad/s] and random walk of the bias [rad/s/sqrt(s)] of the mean of all gyros."""
-        information = np.array([one.noise(period) ** -2.0 for one in self.gyros])
+        information = np.array([gyro.noise(period) ** -2.0 for gyro in self.gyros])
         weights = information / np.sum(information)
-        each = [[one.noise(period), one.rate_bias, one.rate_bias_walk] for one in self.gyros]
-        noise, bias, walk = (float(np.linalg.norm(weights * values)) for values in zip(*each, strict=True))
+        errors = [[gyro.noise(period), gyro.rate_bias, gyro.rate_bias_walk] for gyro in self.gyros]
+        noise, bias, walk = (float(np.linalg.norm(weights * values)) for values in zip(*errors, strict=True))
         return noise, bias, walk
 
-    def short_form(self, table: Hardware, period: float | None) -> Hardware:
+    def equivalent_hardware(self, table: Hardware, period: float | None) -> Hardware:
         """Return [hardware] with one star tracker and one gyro of about the same accuracy, for defaults and bounds.
 
         Args:
@@ -317,24 +323,24 @@ class SensorSuite(Table, frozen=True):
         """
         if period is None:  # the loop is continuous, or its period is not known yet
             return table
-        intervals = {name: max(one.interval(period), period) for name, one in self.attitude.items()}
+        intervals = {name: max(sensor.interval(period), period) for name, sensor in self.attitude.items()}
         interval = min(intervals.values())
-        rate = sum(one.information() / intervals[name] for name, one in self.attitude.items())
-        sigma = float(1.0 / np.sqrt(max(np.linalg.eigvalsh(rate)[0], 1e-30) * interval))
-        noise, bias, walk = self.gyro(period)
+        information_rate = sum(sensor.information() / intervals[name] for name, sensor in self.attitude.items())
+        sigma = float(1.0 / np.sqrt(max(np.linalg.eigvalsh(information_rate)[0], 1e-30) * interval))
+        noise, bias, walk = self.mean_gyro(period)
         return msgspec.structs.replace(
             table, attitude_noise=sigma, rate_noise=noise, rate_bias=bias, rate_bias_walk=walk,
             star_tracker_period=interval,
         )  # fmt: skip
 
     def build(self, model: Any, period: float) -> Any:
-        """Return the sensors of `devices.sensor_suite`; model: not used, period: of control [s]."""
+        """Return the sensors of `devices.sensor_suite`; model: not used, period: control period [s]."""
         sensors = [table.build(name, period) for name, table in self.attitude.items()]
-        noise, bias, walk = self.gyro(period)
-        gyro, drift = jnp.full(3, noise), jnp.full(3, formulas.per_sample(walk, period))
-        made = kalman_filter.kalman_filter(sensors, gyro, drift, bias, period)
+        noise, bias, walk = self.mean_gyro(period)
+        gyro, bias_rate = jnp.full(3, noise), jnp.full(3, formulas.noise_per_sample(walk, period))
+        estimator = kalman_filter.kalman_filter(sensors, gyro, bias_rate, bias, period)
         return sensor_suite.SensorSuite(
-            sensors=tuple(sensors), rate_noise=gyro, rate_bias=jnp.full(3, bias), bias_rate=drift, filter=made
+            sensors=tuple(sensors), rate_noise=gyro, rate_bias=jnp.full(3, bias), bias_rate=bias_rate, filter=estimator
         )
 
 

@@ -30,7 +30,7 @@ from ptsmc_jax.simulation.catalogues import CATALOGUE
 
 # Largest number of integration steps of 0.025 rad in two control periods under a comparison law. A run that turns
 # faster is marked.
-BASELINES = 50
+MAX_COMPARISON_STEPS = 50
 _CASE_I: dict[str, Mapping[str, Any]] = {
     "initial": {"quat_xyzw": [0.4714045207910317, -0.3333333333333333, 0.5773502691896258, 0.5773502691896258]},
     "reference": {"quat_xyzw": [0.0, 0.0, 0.0, 1.0]},
@@ -110,8 +110,8 @@ class Flexible(Table, frozen=True):
         except ValueError as error:
             raise ScenarioError(f"flexible.coupling is {errors.brief(self.coupling)}: {error}") from None
 
-    def check_drawn(self, inertia: Any, drawn: Any) -> None:
-        """Raise ScenarioError if random couplings and inertias can be those of no body.
+    def check_random_modes(self, inertia: Any, dispersions: Any) -> None:
+        """Raise ScenarioError if random couplings and inertias may be physically impossible.
 
         A random row of D is at most f times the nominal row, and a random moment at least s times the nominal moment.
         The inertia of the rigid rest of the body is then at least s J - f^2 D'D, which must be positive definite.
@@ -119,25 +119,28 @@ class Flexible(Table, frozen=True):
 
         Args:
             inertia: inertia of the true body [kg m^2].
-            drawn: the table [dispersion].
+            dispersions: the table [dispersion].
         """
-        rows: Any = getattr(drawn, "mode_coupling", None)
-        moments: Any = getattr(drawn, "inertia", None)
-        longest = smallest = 1.0
-        stated, body = "", ""
+        rows: Any = getattr(dispersions, "mode_coupling", None)
+        moments: Any = getattr(dispersions, "inertia", None)
+        largest_factor = smallest_moment = 1.0
+        stated, moment_text = "", ""
         if getattr(moments, "std", 0.0) > 0.0:
-            smallest = 1.0 - moments.farthest * moments.std
-            stated, body = f"dispersion.inertia.std is {moments.std}", f", and moments {smallest:.6g} times as large"
-        if rows is not None and not rows.nothing:
-            longest = 1.0 + rows.farthest * float(rows.of()[0])
-            stated = f"dispersion.mode_coupling.{rows.width} is {getattr(rows, rows.width)}"
+            smallest_moment = 1.0 - moments.largest_deviation * moments.std
+            stated = f"dispersion.inertia.std is {moments.std}"
+            moment_text = f", and moments {smallest_moment:.6g} times as large"
+        if rows is not None and not rows.is_zero:
+            largest_factor = 1.0 + rows.largest_deviation * float(rows.widths()[0])
+            stated = f"dispersion.mode_coupling.{rows.width_key} is {getattr(rows, rows.width_key)}"
         if not stated:
             return
         try:
-            formulas.rest_inertia(smallest * formulas.check_inertia(inertia), longest * np.asarray(self.coupling))
+            formulas.rest_inertia(
+                smallest_moment * formulas.check_inertia(inertia), largest_factor * np.asarray(self.coupling)
+            )
         except ValueError as error:
             raise ScenarioError(
-                f"{stated}, but with rows {longest:.6g} times those of flexible.coupling{body}, "
+                f"{stated}, but with rows {largest_factor:.6g} times those of flexible.coupling{moment_text}, "
                 f"which a trial may have, {error}"
             ) from None
 
@@ -181,7 +184,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
     reaching: ClassVar[float] = 2.0
 
     @classmethod
-    def fallback(cls, plant: Any, given: Collection[str], law: object) -> dict[str, Mapping[str, Any]]:
+    def plant_defaults(cls, plant: Any, given: Collection[str], law: object) -> dict[str, Mapping[str, Any]]:
         """Return the attitudes of the published Case I."""
         return _CASE_I
 
@@ -206,7 +209,8 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
     def devices(self) -> Any:
         """The table [hardware], with one star tracker and one gyro that are equivalent to [[sensors]]."""
         table = super().devices
-        return self.sensors.short_form(table, self.loop.period) if isinstance(self.sensors, SensorSuite) else table
+        suite = self.sensors
+        return suite.equivalent_hardware(table, self.loop.period) if isinstance(suite, SensorSuite) else table
 
     @property
     def reaction_wheels(self) -> Any:
@@ -240,20 +244,20 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
 
     def largest_acceleration(self) -> float | None:
         """Return the acceleration of the error that the weakest axis allows [1/s^2], None without a torque limit."""
-        inertia, found = formulas.check_inertia(self.spacecraft.inertia), []
+        inertia, accelerations = formulas.check_inertia(self.spacecraft.inertia), []
         limits = [self.devices.torque_limit, tables.limit_of(self, "peak_torque")]
-        found += [limit / np.diag(inertia).max() for limit in limits if limit is not None]
+        accelerations += [limit / np.diag(inertia).max() for limit in limits if limit is not None]
         if self.wheels is not None:
-            spread = np.linalg.pinv(formulas.wheel_axes(self.wheels.spin_axes()).T)
-            asked = np.abs(spread @ inertia).max()  # torque of one wheel for a unit acceleration about one axis
+            allocation = np.linalg.pinv(formulas.wheel_axes(self.wheels.spin_axes()).T)
+            wheel_torque = np.abs(allocation @ inertia).max()  # of one wheel, for a unit acceleration about one axis
             limits = [self.wheels.torque_limit, tables.limit_of(self, "peak_wheel_torque")]
-            found += [limit / asked for limit in limits if limit is not None]
-        return 0.5 * float(min(found)) if found else None
+            accelerations += [limit / wheel_torque for limit in limits if limit is not None]
+        return 0.5 * float(min(accelerations)) if accelerations else None
 
     def start_angle(self) -> float:
         """Return the largest angle to the reference at t = 0 [rad], dispersions included."""
         start = np.asarray(attitude_keys.quaternion(self.initial, "initial"), dtype=float)
-        target = np.asarray(self.reference.first(self), dtype=float)
+        target = np.asarray(self.reference.initial_attitude(self), dtype=float)
         target = target * np.copysign(1.0, start @ target)  # both signs are the same attitude
         angle = 4.0 * float(np.arctan2(np.linalg.norm(start - target), np.linalg.norm(start + target)))
         for table in (getattr(self.dispersion, "attitude", None), getattr(self.dispersion, "reference", None)):
@@ -264,15 +268,17 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         """Return tan(angle / 2) for the angle to the reference at t = 0, limited to 160 degrees."""
         return math.tan(0.5 * min(self.start_angle(), math.radians(160.0)))
 
-    def usual_settling(self) -> float:
+    def default_settling_angle(self) -> float:
         """Return the default of `loop.settling_angle` [rad]."""
         noise = self.devices.attitude_noise or 0.0
         return max(1e-3 * min(1.0, self.start_angle() or 1.0), min(5.0 * noise, 1.0))
 
-    def written(self) -> Any:
+    def complete_for_file(self) -> Any:
         """Return the scenario for a file, keys of the filter included."""
-        found = super().written()
-        return found if self.filter is None else msgspec.structs.replace(found, filter=self.filter.written(self))
+        scenario = super().complete_for_file()
+        if self.filter is None:
+            return scenario
+        return msgspec.structs.replace(scenario, filter=self.filter.complete_for_file(self))
 
     @property
     def true_inertia(self) -> Any:
@@ -304,16 +310,16 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
     def check_plant(self) -> None:
         """Raise ScenarioError for invalid attitudes, settling angle, disturbance, pointing or random modes."""
         attitude_keys.quaternion(self.initial, "initial")
-        settled = self.loop.settling_angle
-        if settled >= math.pi:  # probably in degrees: every attitude would count as settled
-            raise wrong("loop.settling_angle", settled, 'less than pi [rad], or with its unit, such as "0.5 deg"')
+        angle = self.loop.settling_angle
+        if angle >= math.pi:  # probably in degrees: every attitude would count as settled
+            raise wrong("loop.settling_angle", angle, 'less than pi [rad], or with its unit, such as "0.5 deg"')
         self.reference.check(self)
-        for place, term in self.placed_terms.items():
+        for place, term in self.terms_by_place.items():
             term.check(place, self)
         if self.pointing is not None:
             self.pointing.check(self)
         if self.flexible is not None:
-            self.flexible.check_drawn(self.true_inertia, self.dispersion)
+            self.flexible.check_random_modes(self.true_inertia, self.dispersion)
 
     def check_reference_until(self, last: float) -> None:
         self.reference.check_reference_until(self, last, "tune.bounds.t_f")
@@ -322,23 +328,23 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         """Return the observation of pointing errors, None without [pointing]."""
         return None if self.pointing is None else self.pointing.build(self)
 
-    def model(self) -> Any:
+    def design_model(self) -> Any:
         """Return the rigid body of the design model."""
         return spacecraft(self.spacecraft.inertia)
 
-    def truth(self, model: Any) -> Any:
+    def true_plant(self, model: Any) -> Any:
         """Return the true plant: the body with its true inertia and its flexible modes."""
         modes = self.flexible
         if modes is None:
             return spacecraft(self.true_inertia)
         return flexible(self.true_inertia, modes.frequency, modes.damping, modes.coupling)
 
-    def start(self) -> Any:
+    def initial_state(self) -> Any:
         """Return attitude and rate at t = 0."""
         q = vector(attitude_keys.quaternion(self.initial, "initial"))
         return AttitudeState(q, vector(self.initial.rate))
 
-    def target(self) -> Any:
+    def build_reference(self) -> Any:
         """Return the reference."""
         return self.reference.build(self)
 
@@ -351,8 +357,12 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
     def _initial_rates(self) -> dict[str, float]:
         """The nominal and the dispersed part of `initial_rate_bound` [rad/s], by key."""
         table = getattr(self.dispersion, "rate", None)
-        drawn = {} if table is None else {f"dispersion.rate.{table.width}": float(table.widest * table.of()[0])}
-        return {"initial.rate": float(np.linalg.norm(self.initial.rate)), **drawn}
+        dispersed = (
+            {}
+            if table is None
+            else {f"dispersion.rate.{table.width_key}": float(table.norm_quantile * table.widths()[0])}
+        )
+        return {"initial.rate": float(np.linalg.norm(self.initial.rate)), **dispersed}
 
     def frequencies(self, setup: Any, t_f: float) -> dict[str, float]:
         """Return the angular frequencies of start, reference, law, wheels and flexible modes [rad/s], by key.
@@ -361,22 +371,24 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
             setup: the parts without a clock.
             t_f: shortest prescribed time [s].
         """
-        found = {**self._initial_rates, **self.reference.frequencies(self)}
+        frequencies = {**self._initial_rates, **self.reference.frequencies(self)}
         key, rate = self.controller.half_turn_rate(t_f)
         if not self.controller.law.prescribed:
-            rate = min(rate, 0.5 * BASELINES * 0.025 / self.loop.period)
-        found[key] = rate
-        for key, rate in self._nutation(setup).items():
-            found[key] = found.get(key, 0.0) + rate
+            rate = min(rate, 0.5 * MAX_COMPARISON_STEPS * 0.025 / self.loop.period)
+        frequencies[key] = rate
+        for key, rate in self._nutation_rates(setup).items():
+            frequencies[key] = frequencies.get(key, 0.0) + rate
         if self.flexible is not None:
-            modes, drawn = self.flexible, getattr(self.dispersion, "mode_frequency", None)
-            most = 1.0 if drawn is None else 1.0 + drawn.farthest * float(drawn.of()[0])
+            modes, dispersion = self.flexible, getattr(self.dispersion, "mode_frequency", None)
+            largest_factor = (
+                1.0 if dispersion is None else 1.0 + dispersion.largest_deviation * float(dispersion.widths()[0])
+            )
             inertia = np.asarray(setup.plant.inertia)
-            fastest = formulas.free_modes(inertia, modes.frequency, modes.coupling).max()
-            found["flexible.frequency"] = most * float(fastest)
-        return found
+            fastest = formulas.free_mode_frequencies(inertia, modes.frequency, modes.coupling).max()
+            frequencies["flexible.frequency"] = largest_factor * float(fastest)
+        return frequencies
 
-    def _nutation(self, setup: Any) -> dict[str, float]:
+    def _nutation_rates(self, setup: Any) -> dict[str, float]:
         """Return bounds on the nutation rate of a body with wheels [rad/s], by the key that causes each of them.
 
         The bound is |H| / sqrt(J_1 J_2) with the two smallest principal moments, from J w' = -w x H + u. In inertial
@@ -386,9 +398,9 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
             return {}
         wheels = setup.actuators.wheels
         least, middle, largest = np.linalg.eigvalsh(np.asarray(setup.plant.inertia))
-        each = {
+        momenta = {
             "wheels.momentum": np.linalg.norm(np.asarray(wheels.axes) @ np.asarray(wheels.initial)),
             **{key: largest * rate for key, rate in self._initial_rates.items()},
             "disturbance.amplitude": sum(term.impulse(self.end) for term in self.terms),
         }
-        return {key: float(moment) / math.sqrt(least * middle) for key, moment in each.items()}
+        return {key: float(moment) / math.sqrt(least * middle) for key, moment in momenta.items()}

@@ -22,7 +22,7 @@ from ptsmc_jax.theory import solutions
 SINGULAR_CONDITION = 1e14  # condition number of a matrix that counts as singular in double precision
 
 
-def check(scenario: Any, parts: Parts, dispersion: Any, *, drawn: bool) -> None:
+def check(scenario: Any, parts: Parts, dispersion: Any, *, dispersed: bool) -> None:
     """Raise ScenarioError if the law meets its singularity on the nominal path, or if it must invert a singular matrix.
 
     Trials with random attitudes are not checked here: a trial that meets the singularity is marked in the results.
@@ -31,24 +31,24 @@ def check(scenario: Any, parts: Parts, dispersion: Any, *, drawn: bool) -> None:
         scenario: the scenario.
         parts: its parts.
         dispersion: its dispersions.
-        drawn: whether dispersed attitudes are simulated. If so, and if attitude or reference is dispersed, the nominal
-            initial attitude is not checked.
+        dispersed: whether dispersed attitudes are simulated. If so, and if attitude or reference is dispersed, the
+            nominal initial attitude is not checked.
     """
     if scenario.motion == "system":
-        system(scenario, parts)
+        check_system(scenario, parts)
     if scenario.motion == "spacecraft":
-        reference(scenario, parts)
-        if not drawn or dispersion.kinds.keys().isdisjoint((INITIAL_ATTITUDE, REFERENCE)):
-            attitude(scenario, parts)
+        check_reference_path(scenario, parts)
+        if not dispersed or dispersion.kinds.keys().isdisjoint((INITIAL_ATTITUDE, REFERENCE)):
+            check_attitude_path(scenario, parts)
 
 
-def system(scenario: Any, parts: Parts) -> None:
+def check_system(scenario: Any, parts: Parts) -> None:
     """Raise ScenarioError if a system is not finite at t = 0, or if law or observer cannot invert it there."""
     start, plant = (jnp.zeros(()), parts.initial), typing.cast(System, parts.controller.model)
-    _finite("system", plant, *start)
+    _check_finite("system", plant, *start)
     if scenario.plant.truth is not None:
-        _finite("truth", typing.cast(System, parts.plant), *start)
-    matrices = {"dF/dx2 G": plant.slope(*start) @ plant.input_gain(*start)}
+        _check_finite("truth", typing.cast(System, parts.plant), *start)
+    matrices = {"dF/dx2 G": plant.rate_jacobian(*start) @ plant.input_gain(*start)}
     if parts.observer.estimates:
         matrices["D"] = plant.disturbance_gain(*start)
     for name, matrix in matrices.items():
@@ -60,10 +60,10 @@ def system(scenario: Any, parts: Parts) -> None:
             )
 
 
-def _finite(key: str, plant: System, t: Array, x: Array) -> None:
+def _check_finite(key: str, plant: System, t: Array, x: Array) -> None:
     """Raise ScenarioError if a function of a system is not finite in this state; key: "system" or "truth"."""
     functions = {"F": plant.position_rate, "H": plant.drift, "G": plant.input_gain, "D": plant.disturbance_gain}
-    values = [(name, function(t, x)) for name, function in (*functions.items(), ("dF/dx2", plant.slope))]
+    values = [(name, function(t, x)) for name, function in (*functions.items(), ("dF/dx2", plant.rate_jacobian))]
     values += [("Z", z) for z in plant.hidden_rates(t, x, jnp.zeros(plant.inputs))]
     for name, value in values:
         if not np.all(np.isfinite(np.asarray(value))):
@@ -73,29 +73,33 @@ def _finite(key: str, plant: System, t: Array, x: Array) -> None:
             )
 
 
-_SINGULAR = "q4 = 0 (180 degrees from the inertial frame's identity), which the additive law cannot cross"
-_OPPOSITE = "q_e4 = 0 (180 degrees from the reference), at which the law is singular"
+_Q4_ZERO = "q4 = 0 (180 degrees from the inertial frame's identity), which the additive law cannot cross"
+_QE4_ZERO = "q_e4 = 0 (180 degrees from the reference), at which the law is singular"
 
 
-def reference(scenario: Any, parts: Parts) -> None:
+def check_reference_path(scenario: Any, parts: Parts) -> None:
     """Raise ScenarioError if the additive law meets its singularity q4 = 0 on the reference."""
     if not parts.controller.kinematics.additive:
         return
-    grid = np.linspace(0.0, float(parts.t_end), 4001)
-    held = np.asarray(_scalar_part(parts.reference, grid))
-    if not np.all(np.isfinite(held)):
-        when = float(grid[int(np.argmin(np.isfinite(held)))])
+    times = np.linspace(0.0, float(parts.t_end), 4001)
+    scalar_parts = np.asarray(_scalar_part(parts.reference, times))
+    if not np.all(np.isfinite(scalar_parts)):
+        time = float(times[int(np.argmin(np.isfinite(scalar_parts)))])
         raise ScenarioError(
             f"reference.kind is {errors.show(scenario.reference.kind)}, but its attitude is not finite at "
-            f"t = {when:.4g} s; allowed are finite numbers until t_end"
+            f"t = {time:.4g} s; allowed are finite numbers until t_end"
         )
-    worst = int(np.argmin(np.abs(held)))
-    crosses = np.any(np.sign(held) != np.sign(held[0]))
-    if crosses or abs(held[worst]) < SINGULAR_DISTANCE:
-        when = float(grid[int(np.argmax(np.sign(held) != np.sign(held[0])))]) if crosses else float(grid[worst])
+    closest = int(np.argmin(np.abs(scalar_parts)))
+    crosses = np.any(np.sign(scalar_parts) != np.sign(scalar_parts[0]))
+    if crosses or abs(scalar_parts[closest]) < SINGULAR_DISTANCE:
+        time = (
+            float(times[int(np.argmax(np.sign(scalar_parts) != np.sign(scalar_parts[0])))])
+            if crosses
+            else float(times[closest])
+        )
         raise ScenarioError(
-            f"reference.kind is {errors.show(scenario.reference.kind)}, but its attitude reaches {_SINGULAR}, "
-            f"at t = {when:.4g} s; allowed is a reference that stays away from it until t_end, "
+            f"reference.kind is {errors.show(scenario.reference.kind)}, but its attitude reaches {_Q4_ZERO}, "
+            f"at t = {time:.4g} s; allowed is a reference that stays away from it until t_end, "
             'or controller.error = "multiplicative"'
         )
 
@@ -106,25 +110,25 @@ def _scalar_part(reference: Any, times: Array) -> Array:
     return lapack.vmap(lambda time: reference(time).q[3])(times)
 
 
-def attitude(scenario: Any, parts: Parts) -> None:
+def check_attitude_path(scenario: Any, parts: Parts) -> None:
     """Raise ScenarioError if the nominal path from the initial attitude to the reference meets the singularity."""
     law = parts.controller
-    singular, name = (_SINGULAR, "|q4|") if law.kinematics.additive else (_OPPOSITE, "|q_e4|")
+    singularity, name = (_Q4_ZERO, "|q4|") if law.kinematics.additive else (_QE4_ZERO, "|q_e4|")
     key, value = attitude_keys.attitude_key(scenario.initial)
     if law.prescribed:
-        times, _, square = (np.asarray(v) for v in solutions.exact_path(parts))
+        times, _, square_distance = (np.asarray(v) for v in solutions.exact_path(parts))
     else:  # the path of other laws is not known, so only the start is checked
         target = parts.reference(jnp.zeros_like(parts.t_end))
         first = law.singularity_distance(law.kinematics.align(parts.initial, target), target)
-        times, square = np.zeros(1), np.square([float(first)])
-    if square[0] < SINGULAR_DISTANCE**2:
+        times, square_distance = np.zeros(1), np.square([float(first)])
+    if square_distance[0] < SINGULAR_DISTANCE**2:
         allowed = f"{name} of at least {SINGULAR_DISTANCE}"
-        raise errors.refused(f"initial.{key}", value, f", but lies at {singular}; allowed is {allowed}", allowed)
-    if square.min() < SINGULAR_DISTANCE**2:
-        when = float(times[int(np.argmin(square))])
+        raise errors.value_error(f"initial.{key}", value, f", but lies at {singularity}; allowed is {allowed}", allowed)
+    if square_distance.min() < SINGULAR_DISTANCE**2:
+        time = float(times[int(np.argmin(square_distance))])
         allowed = f"a start whose path keeps {name} above {SINGULAR_DISTANCE}"
         reason = (
             f" with initial.rate = {errors.brief(scenario.initial.rate)}, but from there the path to the reference "
-            f"meets {singular}, at t = {when:.4g} s; allowed is {allowed}"
+            f"meets {singularity}, at t = {time:.4g} s; allowed is {allowed}"
         )
-        raise errors.refused(f"initial.{key}", value, reason, allowed)
+        raise errors.value_error(f"initial.{key}", value, reason, allowed)

@@ -23,7 +23,7 @@ from ptsmc_jax.scenario.values import Kinds, Meaning, Numbers, Table
 from ptsmc_jax.signals.references import CurrentTime, Origin
 from ptsmc_jax.simulation.catalogues import STATE_CATALOGUE
 
-_PAPERS = "prescribed_time"
+_PRESCRIBED_TIME = "prescribed_time"
 
 
 class ChainPlant(Table, frozen=True):
@@ -62,7 +62,7 @@ class SystemPlant(Table, frozen=True):
     x0: Annotated[Numbers, Meaning("initial state, x_1 and then x_2")] = (1.0, 0.0)
 
 
-def tables_of(plant: type[Table], kind: str) -> dict[str, type[Table] | Kinds]:
+def tables_by_name(plant: type[Table], kind: str) -> dict[str, type[Table] | Kinds]:
     """Return the tables of a scenario; kind: the key of its disturbances, laws and observers in their registries."""
     return {
         "plant": plant,
@@ -84,14 +84,14 @@ class StateScenario(Scenario, frozen=True, kw_only=True):
 
     metrics: ClassVar[Any] = STATE_CATALOGUE
 
-    def resolved(self) -> Any:
+    def fill_plant_defaults(self) -> Any:
         """Return the scenario with one width of the dispersed initial state for each state."""
-        drawn = getattr(self.dispersion, "x0", None)
-        if drawn is None:
+        dispersed = getattr(self.dispersion, "x0", None)
+        if dispersed is None:
             return self
-        width = getattr(drawn, drawn.width) or (1.0,) * len(self.plant.x0)
-        drawn = msgspec.structs.replace(drawn, **{drawn.width: width})
-        return msgspec.structs.replace(self, dispersion=msgspec.structs.replace(self.dispersion, x0=drawn))
+        width = getattr(dispersed, dispersed.width_key) or (1.0,) * len(self.plant.x0)
+        dispersed = msgspec.structs.replace(dispersed, **{dispersed.width_key: width})
+        return msgspec.structs.replace(self, dispersion=msgspec.structs.replace(self.dispersion, x0=dispersed))
 
     def start_tangent(self) -> float:
         """Return |x_1| at t = 0, which determines the first acceleration."""
@@ -103,7 +103,7 @@ class StateScenario(Scenario, frozen=True, kw_only=True):
         known = [limit for limit in limits if limit is not None]
         return min(known) if known and self.plant.kind == "chain" else None
 
-    def usual_settling(self) -> float:
+    def default_settling_angle(self) -> float:
         """Return the default of `loop.settling_angle` in units of x_1: 2e-4 |x_1(0)|, or five sigma of the noise."""
         noises = getattr(self.hardware, "state_noise", None) or (0.0,)
         return max(2e-4 * (self.start_tangent() or 5.0), 5.0 * max(noises[: self.inputs]))
@@ -112,13 +112,13 @@ class StateScenario(Scenario, frozen=True, kw_only=True):
         """Raise ScenarioError for lists whose length is not the number of inputs or states."""
         self.devices.check(self)
         m = self.inputs
-        for place, table in {**self.placed_terms, "observer": self.observer}.items():
-            for key in table.each:
+        for place, table in {**self.terms_by_place, "observer": self.observer}.items():
+            for key in table.keys_per_input:
                 value = getattr(table, key)
                 if value is not None and len(value) != m:
                     raise wrong(f"{place}.{key}", value, f"a list of {m} number{'s' * (m > 1)}, one for each input")
 
-    def start(self) -> Any:
+    def initial_state(self) -> Any:
         """Return the state x0."""
         return vector(self.plant.x0)
 
@@ -126,11 +126,11 @@ class StateScenario(Scenario, frozen=True, kw_only=True):
 class ChainScenario(StateScenario, frozen=True, kw_only=True):
     """A scenario of an integrator chain."""
 
-    TABLES: ClassVar[Mapping[str, type[Table] | Kinds]] = tables_of(ChainPlant, "chain")
+    TABLES: ClassVar[Mapping[str, type[Table] | Kinds]] = tables_by_name(ChainPlant, "chain")
     motion: ClassVar[str] = "chain"
 
     @classmethod
-    def fallback(cls, plant: Any, given: Collection[str], law: object) -> dict[str, Mapping[str, Any]]:
+    def plant_defaults(cls, plant: Any, given: Collection[str], law: object) -> dict[str, Mapping[str, Any]]:
         """Return the defaults of a chain: the published cases of Figs. 1 and 2 for the orders 2 and 3.
 
         All laws have the published t_f. Surfaces of all orders have their poles at -1. If the order is absent, it is
@@ -149,8 +149,8 @@ class ChainScenario(StateScenario, frozen=True, kw_only=True):
             raise wrong("plant.x0", plant.x0, "a list of at least 2 numbers")
         x0 = [*(5.0, 3.0, 2.0)[:order], *[0.0] * (order - 3)]
         poles_at_minus_one = [float(math.comb(order - 1, i)) for i in range(order - 1)]  # (p + 1)^(n-1); order 2: (9)
-        papers = {"eta": order + 1.0, "a": poles_at_minus_one} if law == _PAPERS else {}
-        return {"plant": {"x0": x0, "order": order}, "controller": {"t_f": 5.0, **papers}}
+        law_gains = {"eta": order + 1.0, "a": poles_at_minus_one} if law == _PRESCRIBED_TIME else {}
+        return {"plant": {"x0": x0, "order": order}, "controller": {"t_f": 5.0, **law_gains}}
 
     @property
     def inputs(self) -> int:
@@ -168,11 +168,11 @@ class ChainScenario(StateScenario, frozen=True, kw_only=True):
         if len(self.plant.x0) != n:
             raise wrong("plant.x0", self.plant.x0, f"a list of plant.order = {n} numbers")
 
-    def model(self) -> Any:
+    def design_model(self) -> Any:
         """Return the chain."""
         return chain(self.plant.order)
 
-    def target(self) -> Any:
+    def build_reference(self) -> Any:
         """Return the reference, rest at the origin."""
         return Origin()
 
@@ -180,11 +180,11 @@ class ChainScenario(StateScenario, frozen=True, kw_only=True):
 class SystemScenario(StateScenario, frozen=True, kw_only=True):
     """A scenario of a custom system."""
 
-    TABLES: ClassVar[Mapping[str, type[Table] | Kinds]] = tables_of(SystemPlant, "system")
+    TABLES: ClassVar[Mapping[str, type[Table] | Kinds]] = tables_by_name(SystemPlant, "system")
     motion: ClassVar[str] = "system"
 
     @classmethod
-    def fallback(cls, plant: Any, given: Collection[str], law: object) -> dict[str, Mapping[str, Any]]:
+    def plant_defaults(cls, plant: Any, given: Collection[str], law: object) -> dict[str, Mapping[str, Any]]:
         """Return the published t_f of a chain; raise ScenarioError if x0 has an odd length."""
         if len(plant.x0) % 2:
             raise wrong("plant.x0", plant.x0, "a list of x_1 followed by x_2, as many numbers each")
@@ -199,44 +199,46 @@ class SystemScenario(StateScenario, frozen=True, kw_only=True):
         """Raise ScenarioError for invalid names of systems. Files are not run, since the user may only read them."""
         plant = self.plant
         if plant.system is None:
-            raise ScenarioError(f"plant.system is absent, but must be given: {systems.ALLOWED}")
+            raise ScenarioError(f"plant.system is absent, but must be given: {systems.SYSTEM_NAME_FORMS}")
         for key, value in (("system", plant.system), ("truth", plant.truth)):
             if isinstance(value, str):
                 try:
-                    systems.named(value, systems.ALLOWED)
+                    systems.split_name(value, systems.SYSTEM_NAME_FORMS)
                 except ValueError as error:
                     raise ScenarioError(f"plant.{key} is {errors.brief(value)}: {error}") from None
             elif value is not None:
-                self._loaded(key)
+                self._load_system(key)
 
-    def model(self) -> Any:
+    def design_model(self) -> Any:
         """Return the design model, plant.system; raise ScenarioError if it cannot be loaded."""
-        return self._loaded("system")
+        return self._load_system("system")
 
-    def truth(self, model: Any) -> Any:
+    def true_plant(self, model: Any) -> Any:
         """Return the true plant, plant.truth or the design model; raise ScenarioError if it cannot be loaded."""
-        return model if self.plant.truth is None else self._loaded("truth")
+        return model if self.plant.truth is None else self._load_system("truth")
 
-    def _loaded(self, key: str) -> Any:
+    def _load_system(self, key: str) -> Any:
         """Return the system of a key, and run its file if the key names one."""
         value = getattr(self.plant, key)
         try:
-            found = systems.load(value)
+            system = systems.load(value)
         except ValueError as error:
             raise ScenarioError(f"plant.{key} is {errors.brief(value)}: {error}") from None
-        if key == "system" and hasattr(found, "z0"):
+        if key == "system" and hasattr(system, "z0"):
             raise ScenarioError(
                 f"plant.system is {errors.brief(value)}, which has states that no law knows (Z, z0); "
                 "allowed is one without, and this one as plant.truth"
             )
-        n, known = found.inputs, len(self.plant.x0) // 2
-        if n != known and key == "truth":  # x0 fits the system, which is loaded first
+        n, expected = system.inputs, len(self.plant.x0) // 2
+        if n != expected and key == "truth":  # x0 fits the system, which is loaded first
             shown = errors.brief(value)
-            raise ScenarioError(f"plant.truth is {shown}, which has n = {n}; allowed is n = {known}, as plant.system")
+            raise ScenarioError(
+                f"plant.truth is {shown}, which has n = {n}; allowed is n = {expected}, as plant.system"
+            )
         if n * 2 != len(self.plant.x0):
             raise wrong("plant.x0", self.plant.x0, f"a list of {2 * n} numbers, since plant.{key} has n = {n}")
-        return found
+        return system
 
-    def target(self) -> Any:
+    def build_reference(self) -> Any:
         """Return the time as the reference: x_1 is already an error."""
         return CurrentTime()

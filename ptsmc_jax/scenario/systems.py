@@ -1,7 +1,7 @@
 """Load custom systems, classes and functions by name, "FILE.py:NAME" or "package.module:NAME".
 
-Start with `item`. `named` and `location` examine the name only. `item` and `load` run the code, and `checksum` may run
-packages around a module.
+Start with `load_object`. `split_name` and `location` examine the name only. `load_object` and `load` run the code.
+`checksum` may run packages around a module.
 """
 
 import ast
@@ -21,13 +21,13 @@ from typing import NamedTuple
 from ptsmc_jax import configure
 from ptsmc_jax.plants.second_order import System
 
-WHERE = '"FILE.py:NAME" or "package.module:NAME"'
-ALLOWED = f"{WHERE}, a system made with plants.system"
-LONGEST = 4096  # characters of a path, on Linux
-OURS = ("ptsmc_jax", "tuning")  # packages that are never helpers of custom code
+NAME_FORMS = '"FILE.py:NAME" or "package.module:NAME"'
+SYSTEM_NAME_FORMS = f"{NAME_FORMS}, a system made with plants.system"
+LONGEST_PATH = 4096  # characters of a path, on Linux
+OWN_PACKAGES = ("ptsmc_jax", "tuning")  # packages that are never helpers of custom code
 
 
-class _Ran(NamedTuple):
+class _ExecutedFile(NamedTuple):
     """A file that was run."""
 
     module: ModuleType
@@ -35,148 +35,148 @@ class _Ran(NamedTuple):
 
 
 _NO_DERIVATIVES = re.compile("support JVP|Differentiation rule for")  # in JAX's messages for code without derivatives
-_files: set[str] = set()  # real paths of all files that were run
-_ran: dict[tuple[str, str], _Ran] = {}  # by path and SHA-256, so that a changed file is run again
+_executed_paths: set[str] = set()  # real paths of all files that were run
+_executed_files: dict[tuple[str, str], _ExecutedFile] = {}  # by path and SHA-256, so that a changed file is run again
 # helper modules that custom files imported from their own folder: path and SHA-256 by name
 _helpers: dict[str, tuple[str, str | None]] = {}
 
 
-def named(where: str, allowed: str) -> tuple[str, str]:
+def split_name(qualified_name: str, allowed: str) -> tuple[str, str]:
     """Split a text into the file or module and the name in it; raise ValueError if it is not of this form.
 
     Nothing is run. `allowed` describes the allowed texts in the error.
     """
-    place, _, name = where.rpartition(":")
+    place, _, name = qualified_name.rpartition(":")
     file = place.endswith(".py")
-    if not name.isidentifier() or len(where) > LONGEST or not where.isprintable():
+    if not name.isidentifier() or len(qualified_name) > LONGEST_PATH or not qualified_name.isprintable():
         place = ""
     if not place or not (file or all(part.isidentifier() for part in place.split("."))):
         raise ValueError(f"it names nothing; allowed is {allowed}")
     return place, name
 
 
-def location(where: str) -> str:
+def location(qualified_name: str) -> str:
     """Return the real path of the file, or "the module NAME", so that the user can read the code before a run."""
-    place = where.rpartition(":")[0]
+    place = qualified_name.rpartition(":")[0]
     return os.path.realpath(place) if place.endswith(".py") else f"the module {place}"
 
 
-def load(where: object) -> System:
+def load(system_or_name: object) -> System:
     """Return a system, or load it by its name; raise ValueError if there is none.
 
-    The result is the same object as long as the file does not change, see `item`.
+    The result is the same object as long as the file does not change, see `load_object`.
     """
-    if not isinstance(where, str):
-        if not isinstance(where, System):
-            raise ValueError(f"allowed is {ALLOWED}")
-        return where
-    found = item(where, ALLOWED)
-    if not isinstance(found, System):
-        place = where.rpartition(":")[0]
-        raise ValueError(f"{place} has a {type(found).__name__} of that name; allowed is {ALLOWED}")
-    return found
+    if not isinstance(system_or_name, str):
+        if not isinstance(system_or_name, System):
+            raise ValueError(f"allowed is {SYSTEM_NAME_FORMS}")
+        return system_or_name
+    loaded = load_object(system_or_name, SYSTEM_NAME_FORMS)
+    if not isinstance(loaded, System):
+        place = system_or_name.rpartition(":")[0]
+        raise ValueError(f"{place} has a {type(loaded).__name__} of that name; allowed is {SYSTEM_NAME_FORMS}")
+    return loaded
 
 
-def item(where: str, allowed: str) -> object:
+def load_object(qualified_name: str, allowed: str) -> object:
     """Run the file or module and return the object of the name in it.
 
     A file can import from its own folder, and a module from the current folder. A file runs again only if it or a file
     that it imported has changed.
 
     Args:
-        where: "FILE.py:NAME" or "package.module:NAME".
+        qualified_name: "FILE.py:NAME" or "package.module:NAME".
         allowed: description of the allowed texts, for errors.
 
     Raises:
         ValueError: there is no such file or name, or running it fails; the message has one line.
     """
-    place, name = named(where, allowed)
+    place, name = split_name(qualified_name, allowed)
     path = Path(place)
-    content = _content(path) if place.endswith(".py") else b""
+    content = _read_file(path) if place.endswith(".py") else b""
     try:
-        with _importing_from(_home(place)):
-            module = _run(path, content) if place.endswith(".py") else importlib.import_module(place)
+        with _importing_from(_import_folder(place)):
+            module = _run_file(path, content) if place.endswith(".py") else importlib.import_module(place)
     except (Exception, SystemExit) as error:
-        raise ValueError(f"running {place} fails: {failure(error, place)}") from error
-    _files.add(os.path.realpath(getattr(module, "__file__", None) or place))
+        raise ValueError(f"running {place} fails: {describe_failure(error, place)}") from error
+    _executed_paths.add(os.path.realpath(getattr(module, "__file__", None) or place))
     if not hasattr(module, name):
         raise ValueError(f"{place} has no such name; allowed is {allowed}")
     return getattr(module, name)
 
 
-def failure(error: BaseException, place: str) -> str:
+def describe_failure(error: BaseException, place: str) -> str:
     """Describe an error in custom code in one line: its type and text, and the line of the file that raised it."""
-    return f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}{line(error, place)}"
+    return f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}{failing_line(error, place)}"
 
 
-def at_fault(error: BaseException) -> str | None:
+def find_faulty_file(error: BaseException) -> str | None:
     """Return the custom file that caused an error, None if no custom code is involved.
 
     JAX reports leaked tracers and missing derivatives later, when no custom file is in the traceback. All custom files
     that were run are then returned, joined by "or".
     """
     if type(error).__name__ == "UnexpectedTracerError" or _NO_DERIVATIVES.search(str(error)):
-        return " or ".join(sorted(_files)) or None
-    walked = [os.path.realpath(frame.f_code.co_filename) for frame, _ in traceback.walk_tb(error.__traceback__)]
-    return next((file for file in reversed(walked) if file in _files), None)
+        return " or ".join(sorted(_executed_paths)) or None
+    files = [os.path.realpath(frame.f_code.co_filename) for frame, _ in traceback.walk_tb(error.__traceback__)]
+    return next((file for file in reversed(files) if file in _executed_paths), None)
 
 
-def line(error: BaseException, place: str) -> str:
+def failing_line(error: BaseException, place: str) -> str:
     """Return the last line of a file in an error's traceback as " (line 3 of FILE.py)", empty if there is none."""
-    walked = [(frame.f_code.co_filename, number) for frame, number in traceback.walk_tb(error.__traceback__)]
-    numbers = [number for file, number in walked if os.path.realpath(file) == os.path.realpath(place)]
+    frames = [(frame.f_code.co_filename, number) for frame, number in traceback.walk_tb(error.__traceback__)]
+    numbers = [number for file, number in frames if os.path.realpath(file) == os.path.realpath(place)]
     return f" (line {numbers[-1]} of {Path(place).name})" if numbers else ""
 
 
-def checksum(where: object) -> str | None:
+def checksum(qualified_name: object) -> str | None:
     """Return the SHA-256 of the file of a system or a function and of the files beside it that it imports.
 
     The result is None if there is no file. To find a module, Python runs the packages that contain it.
     """
-    place = where.rpartition(":")[0] if isinstance(where, str) else ""
+    place = qualified_name.rpartition(":")[0] if isinstance(qualified_name, str) else ""
     file: str | None = place
     if place and not place.endswith(".py"):
         try:
-            with _importing_from(_home(place)):
+            with _importing_from(_import_folder(place)):
                 spec = importlib.util.find_spec(place)
-        except (Exception, SystemExit):  # `item` reports the error
+        except (Exception, SystemExit):  # `load_object` reports the error
             spec = None
         file = None if spec is None else spec.origin
     if not file or sha256(file) is None:
         return None
-    first, *others = imported(Path(file), Path(_home(place)))
+    first, *others = list_imported_files(Path(file), Path(_import_folder(place)))
     if not others:
         return sha256(str(first))
-    each = sorted((one.name, str(sha256(str(one)))) for one in (first, *others))
-    return hashlib.sha256(repr(each).encode()).hexdigest()
+    checksums = sorted((source.name, str(sha256(str(source)))) for source in (first, *others))
+    return hashlib.sha256(repr(checksums).encode()).hexdigest()
 
 
-def imported(file: Path, folder: Path) -> list[Path]:
+def list_imported_files(file: Path, folder: Path) -> list[Path]:
     """Return a Python file and the files of a folder that it imports, directly or not, according to their source."""
-    found: list[Path] = []
-    waiting = [file]
-    while waiting:
-        one = waiting.pop()
-        if one in found:
+    files: list[Path] = []
+    pending = [file]
+    while pending:
+        source = pending.pop()
+        if source in files:
             continue
-        found.append(one)
+        files.append(source)
         with contextlib.suppress(OSError, ValueError, SyntaxError, RecursionError):
-            for node in ast.walk(ast.parse(one.read_bytes())):
+            for node in ast.walk(ast.parse(source.read_bytes())):
                 names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
                 names += [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
-                tops = {name.partition(".")[0] for name in names} - set(OURS)
-                waiting += [path for top in sorted(tops) for path in _files_of(folder / top)]
-    return found
+                packages = {name.partition(".")[0] for name in names} - set(OWN_PACKAGES)
+                pending += [path for package in sorted(packages) for path in _module_files(folder / package)]
+    return files
 
 
-def _files_of(module: Path) -> list[Path]:
+def _module_files(module: Path) -> list[Path]:
     """Return the files of a module or a package; none if there is no such module."""
     if module.is_dir():
         return sorted({module / "__init__.py", *module.rglob("*.py")})
     return [*filter(Path.is_file, [module.with_suffix(".py")])]
 
 
-def _content(path: Path) -> bytes:
+def _read_file(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except (FileNotFoundError, NotADirectoryError):
@@ -185,41 +185,41 @@ def _content(path: Path) -> bytes:
         raise ValueError(f"it cannot be read: {error.strerror}") from None
 
 
-def _home(place: str) -> str:
+def _import_folder(place: str) -> str:
     """Return the folder that custom code can import from: the folder of the file, or the current folder."""
     return os.path.realpath(Path(place).parent if place.endswith(".py") else Path.cwd())
 
 
 @contextlib.contextmanager
 def _importing_from(folder: str) -> Iterator[None]:
-    written, sys.dont_write_bytecode = sys.dont_write_bytecode, True  # a .pyc hides a change within a second
+    previous, sys.dont_write_bytecode = sys.dont_write_bytecode, True  # a .pyc hides a change within a second
     sys.path.insert(0, folder)
     try:
         yield
     finally:
         sys.path.remove(folder)
-        sys.dont_write_bytecode = written
+        sys.dont_write_bytecode = previous
 
 
-def _run(path: Path, content: bytes) -> ModuleType:
+def _run_file(path: Path, content: bytes) -> ModuleType:
     """Run a file as a module with a unique name, and return the module.
 
     Files of the same name in different folders, and their helper modules, are kept apart. The source itself is run,
     never a compiled copy from a __pycache__ folder.
     """
-    known = os.path.realpath(path), hashlib.sha256(content).hexdigest()
-    ran = _ran.get(known)
-    if ran is not None and all(sha256(file) == sha for file, sha in ran.helpers.items()):
-        return ran.module
-    home = _home(str(path))
-    if not all(file.startswith(home + os.sep) and sha256(file) == sha for file, sha in _helpers.values()):
+    key = os.path.realpath(path), hashlib.sha256(content).hexdigest()
+    executed = _executed_files.get(key)
+    if executed is not None and all(sha256(file) == sha for file, sha in executed.helpers.items()):
+        return executed.module
+    folder = _import_folder(str(path))
+    if not all(file.startswith(folder + os.sep) and sha256(file) == sha for file, sha in _helpers.values()):
         for name in _helpers:  # remove all helpers, since they may import each other
             sys.modules.pop(name, None)
         _helpers.clear()
         importlib.invalidate_caches()
     before = set(sys.modules)
-    unique = hashlib.sha256("".join(known).encode(errors="surrogateescape")).hexdigest()[:12]
-    spec = importlib.util.spec_from_file_location(f"_ptsmc_jax_{path.stem}_{unique}", path)
+    suffix = hashlib.sha256("".join(key).encode(errors="surrogateescape")).hexdigest()[:12]
+    spec = importlib.util.spec_from_file_location(f"_ptsmc_jax_{path.stem}_{suffix}", path)
     assert spec is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # dataclasses look up their module there
@@ -230,19 +230,19 @@ def _run(path: Path, content: bytes) -> ModuleType:
         del sys.modules[spec.name]
         raise
     finally:
-        _helpers.update(_beside(home, before))
-    _ran[known] = _Ran(module, dict(_helpers.values()))
+        _helpers.update(_imported_helpers(folder, before))
+    _executed_files[key] = _ExecutedFile(module, dict(_helpers.values()))
     return module
 
 
-def _beside(home: str, before: set[str]) -> dict[str, tuple[str, str | None]]:
+def _imported_helpers(folder: str, before: set[str]) -> dict[str, tuple[str, str | None]]:
     """Return path and SHA-256, by name, of the modules that were imported from a folder since `before`."""
-    found = {}
+    helpers = {}
     for name in set(sys.modules) - before:
-        top, file = name.partition(".")[0], os.path.realpath(getattr(sys.modules[name], "__file__", None) or "")
-        if top not in OURS and top not in before and file.startswith(os.path.join(home, top)):
-            found[name] = file, sha256(file)
-    return found
+        package, file = name.partition(".")[0], os.path.realpath(getattr(sys.modules[name], "__file__", None) or "")
+        if package not in OWN_PACKAGES and package not in before and file.startswith(os.path.join(folder, package)):
+            helpers[name] = file, sha256(file)
+    return helpers
 
 
 def sha256(file: str) -> str | None:

@@ -121,9 +121,12 @@ class Limit(Table, frozen=True):
 
 
 # gains that tuning can change, without the gains of custom parts
-OF_NO_LAW = ("observer_gain", "filter_bandwidth", "command_corner")
-FREE = (*dict.fromkeys(name for laws in LAWS.values() for law in laws.values() for name in law.gains), *OF_NO_LAW)
-FREE_ALLOWED = f"a list of some of {', '.join(FREE)}"
+NON_LAW_GAINS = ("observer_gain", "filter_bandwidth", "command_corner")
+TUNABLE_GAINS = (
+    *dict.fromkeys(name for laws in LAWS.values() for law in laws.values() for name in law.gains),
+    *NON_LAW_GAINS,
+)
+FREE_ALLOWED = f"a list of some of {', '.join(TUNABLE_GAINS)}"
 FreeGains = Annotated[tuple[str, ...], Meta(min_length=1, description=FREE_ALLOWED)]
 
 
@@ -241,7 +244,7 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
         return type(self).__name__ + "".join(f"\n  {name}: {table!r}" for name, table in tables.items() if table)
 
     @classmethod
-    def fallback(cls, plant: Any, given: Collection[str], law: object) -> dict[str, Mapping[str, Any]]:
+    def plant_defaults(cls, plant: Any, given: Collection[str], law: object) -> dict[str, Mapping[str, Any]]:
         """Return defaults that depend on the plant and the law, by table and key.
 
         Args:
@@ -256,25 +259,25 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
         """Whether the loop is sampled."""
         return self.loop.mode == "sampled"
 
-    def need_samples(self, what: str) -> None:
-        """Raise ScenarioError unless the loop is sampled; what: the table or key that needs the sampled loop."""
+    def require_sampled_loop(self, user: str) -> None:
+        """Raise ScenarioError unless the loop is sampled; user: the table or key that needs the sampled loop."""
         if not self.sampled:
-            raise ScenarioError(f'{what} needs the sampled loop, but loop.mode is "{self.loop.mode}"')
+            raise ScenarioError(f'{user} needs the sampled loop, but loop.mode is "{self.loop.mode}"')
 
     @property
-    def exact_sign(self) -> bool:
+    def has_discontinuous_sign(self) -> bool:
         """Whether the law switches with the discontinuous sign, which has no derivative."""
         return getattr(self.controller, "sign_width", None) == 0.0
 
     @property
     def terms(self) -> tuple[Any, ...]:
         """The disturbances that act together, one for [disturbance] unless it is a sum."""
-        return tuple(self.placed_terms.values())
+        return tuple(self.terms_by_place.values())
 
     @property
-    def placed_terms(self) -> dict[str, Any]:
+    def terms_by_place(self) -> dict[str, Any]:
         """The same disturbances by their place in a file: "disturbance", or "disturbance.terms[0]" and so on."""
-        return self.disturbance.placed("disturbance")
+        return self.disturbance.tables_by_name("disturbance")
 
     @property
     def inputs(self) -> int:
@@ -288,7 +291,7 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
 
     @property
     def grid_order(self) -> int:
-        """The order that determines the grid of the continuous loop, see `clock.graded`."""
+        """The order that determines the grid of the continuous loop, see `clock.graded_clock`."""
         return self.order
 
     @property
@@ -329,7 +332,7 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
         """Return the initial acceleration of the error / (eta^2 / t_f^2)."""
         raise NotImplementedError
 
-    def usual_settling(self) -> float:
+    def default_settling_angle(self) -> float:
         """Return the default of `loop.settling_angle`."""
         raise NotImplementedError
 
@@ -369,9 +372,9 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
         return getattr(self.controller, "delta", None) or self.loop.period
 
     @property
-    def measured(self) -> bool:
+    def uses_measurements(self) -> bool:
         """Whether the law uses measurements instead of the true state."""
-        return self.estimator.on or self.devices.noisy
+        return self.estimator.on or self.devices.has_sensor_noise
 
     @property
     def search(self) -> Tune:
@@ -395,13 +398,13 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
         """Return the observation of pointing errors, a part of `simulation.pointing`, or None."""
         return None
 
-    def resolved(self) -> Any:
+    def fill_plant_defaults(self) -> Any:
         """Return the scenario with the defaults of its plant that depend on other keys."""
         return self
 
-    def written(self) -> Any:
+    def complete_for_file(self) -> Any:
         """Return the scenario for a file, with all keys that depend on other keys filled in."""
-        return msgspec.structs.replace(self, observer=self.observer.written(self))
+        return msgspec.structs.replace(self, observer=self.observer.complete_for_file(self))
 
     def check_body(self) -> None:
         """Raise ScenarioError if the body or its initial state is not valid, before defaults are derived from it."""
@@ -415,19 +418,19 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
     def check_reference_until(self, last: float) -> None:
         """Raise ScenarioError if the reference ends before `last` [s], the end of the longest run of a search."""
 
-    def model(self) -> Any:
+    def design_model(self) -> Any:
         """Return the design model of law and observer, a part of `plants`."""
         raise NotImplementedError
 
-    def truth(self, model: Any) -> Any:
+    def true_plant(self, model: Any) -> Any:
         """Return the true plant; model: the design model, which is the default."""
         return model
 
-    def start(self) -> Any:
+    def initial_state(self) -> Any:
         """Return the initial state."""
         raise NotImplementedError
 
-    def target(self) -> Any:
+    def build_reference(self) -> Any:
         """Return the reference, a part of `signals.references`."""
         raise NotImplementedError
 
@@ -452,12 +455,13 @@ def limit_of(scenario: Scenario, metric: str) -> float | None:
     return required.limit if isinstance(required, Limit) else required
 
 
-def check_scenario(what: object, besides: str = "") -> Scenario:
+def check_scenario(candidate: object, alternatives: str = "") -> Scenario:
     """Return a scenario; raise TypeError for any other object.
 
-    `besides` names further allowed objects in the error, such as ", or its file".
+    `alternatives` names further allowed objects in the error, such as ", or its file".
     """
-    if not isinstance(what, Scenario):
-        found = type(what).__name__
-        raise TypeError(f"a scenario is needed, as read or from_tables return it{besides}, but this is a {found}")
-    return what
+    if not isinstance(candidate, Scenario):
+        type_name = type(candidate).__name__
+        needed = f"a scenario is needed, as read or from_tables return it{alternatives}"
+        raise TypeError(f"{needed}, but this is a {type_name}")
+    return candidate

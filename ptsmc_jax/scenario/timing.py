@@ -1,4 +1,7 @@
-"""Choose the clock and the integration steps of a run from the fastest rates of the scenario. Start with `timing`."""
+"""Choose the clock and the integration steps of a run from the fastest rates of the scenario.
+
+Start with `choose_timing`.
+"""
 
 import dataclasses
 import functools
@@ -26,8 +29,8 @@ from ptsmc_jax.theory import rates, solutions
 from ptsmc_jax.theory.exact_motion import plant_motion
 
 MOST_SUBSTEPS = 200  # largest number of integration steps in a control period
-# keys of smooth motions: steps of 0.1 rad are accurate enough, see `_substeps`
-_SMOOTHED = ("disturbance.frequency", "plant.system", "flexible.frequency")
+# keys of smooth motions: steps of 0.1 rad are accurate enough, see `_count_substeps`
+_SMOOTH_MOTIONS = ("disturbance.frequency", "plant.system", "flexible.frequency")
 
 
 @dataclass(frozen=True)
@@ -47,18 +50,18 @@ class Reach:
     period: float  # largest control period [s]
 
 
-_INTERVALS = (  # smallest and largest value in `Reach`
+_INTERVALS = (  # fields of `Reach`: smallest and largest value
     ("smallest_t_f", "t_f"), ("smallest_delta", "delta"), ("gain", "largest_gain"), ("smallest_period", "period")
 )  # fmt: skip
-_ABOVE_ZERO = ("smallest_t_f", "t_f", "smallest_period", "period")  # divisors of clocks and steps
+_POSITIVE_FIELDS = ("smallest_t_f", "t_f", "smallest_period", "period")  # divisors of clocks and steps
 
 
-def reach_of(scenario: Scenario, **farther: float) -> Reach:
+def reach_of(scenario: Scenario, **changes: float) -> Reach:
     """Return the reach that contains only the scenario's gains and control period, with some fields changed.
 
     Args:
         scenario: a validated scenario.
-        farther: fields of `Reach` with other values.
+        changes: fields of `Reach` with other values.
 
     Raises:
         ValueError: there is no such field, a value is not finite, is negative or is a time of 0, or a smallest value
@@ -72,26 +75,26 @@ def reach_of(scenario: Scenario, **farther: float) -> Reach:
     """
     check_scenario(scenario)
     names = [field.name for field in dataclasses.fields(Reach)]
-    for name, value in farther.items():
+    for name, value in changes.items():
         if name not in names:
             raise ValueError(f"there is no {name} in a reach; allowed are {', '.join(names)}")
         if np.ndim(value) or np.asarray(value).dtype.kind not in "iuf" or not 0.0 <= value < math.inf:
             raise ValueError(f"{name} is {value!r}, but must be a finite number of at least 0")
-        if name in _ABOVE_ZERO and value == 0.0:
+        if name in _POSITIVE_FIELDS and value == 0.0:
             raise ValueError(f"{name} is {value!r}, but must be greater than 0")
-    table = scenario.controller
+    law = scenario.controller
     gains, delta = getattr(scenario.observer, "gain", (0.0,)), scenario.hand_over
-    k1, width, rate = getattr(table, "k1", 1.0), getattr(table, "sign_width", 0.0), getattr(table, "surface_rate", 1.0)
+    k1, width, rate = getattr(law, "k1", 1.0), getattr(law, "sign_width", 0.0), getattr(law, "surface_rate", 1.0)
     period = scenario.loop.period
-    present = Reach(table.t_f, table.t_f, delta, delta, min(gains), max(gains), k1, width, rate, period, period)
-    made = dataclasses.replace(present, **farther)
+    present = Reach(law.t_f, law.t_f, delta, delta, min(gains), max(gains), k1, width, rate, period, period)
+    reach = dataclasses.replace(present, **changes)
     for low, high in _INTERVALS:
-        if getattr(made, low) > getattr(made, high):
-            raise ValueError(f"{low} is {getattr(made, low):g}, but must be at most {high}, {getattr(made, high):g}")
-    return made
+        if getattr(reach, low) > getattr(reach, high):
+            raise ValueError(f"{low} is {getattr(reach, low):g}, but must be at most {high}, {getattr(reach, high):g}")
+    return reach
 
 
-def timing(scenario: Scenario, setup: Setup, reach: Reach, saves: object) -> tuple[Any, int]:
+def choose_timing(scenario: Scenario, setup: Setup, reach: Reach, saves: object) -> tuple[Any, int]:
     """Return the clock of a run, and the number of integration steps in a control period.
 
     Args:
@@ -103,104 +106,104 @@ def timing(scenario: Scenario, setup: Setup, reach: Reach, saves: object) -> tup
     Raises:
         ScenarioError: the run would need too many steps; the message names the key that causes them.
     """
-    loop, frequencies, visited = scenario.loop, _frequencies(scenario, setup, reach), None
+    loop, frequencies, visited = scenario.loop, _frequencies_by_key(scenario, setup, reach), None
     if reach.t_f > scenario.controller.t_f:
         scenario.check_reference_until(scenario.end + reach.t_f - scenario.controller.t_f)
     if setup.plant.custom_functions:
-        hurried = _with_papers_law(setup.with_t_f(vector(reach.smallest_t_f)))
-        visited = solutions.visited(hurried)
-        frequencies["plant.system"] = _fastest_of_system(hurried, visited)
+        fastest_setup = _with_prescribed_time_law(setup.with_t_f(vector(reach.smallest_t_f)))
+        visited = solutions.visited_states(fastest_setup)
+        frequencies["plant.system"] = _fastest_system_rate(fastest_setup, visited)
     if not scenario.sampled:
         for key in {"plant.system", "flexible.frequency"} & set(frequencies):
             frequencies[key] *= 2.0  # 0.15 rad per step, since a system is unknown and modes ring for a long time
-        return _grid(scenario, reach, setup, saves, frequencies, visited), 1
-    substeps = _substeps(scenario, reach.period, frequencies)
-    last = scenario.end + reach.t_f - scenario.controller.t_f
-    _check_steps(scenario, last, reach.smallest_period, substeps)
+        return _continuous_grid(scenario, reach, setup, saves, frequencies, visited), 1
+    substeps = _count_substeps(scenario, reach.period, frequencies)
+    last_time = scenario.end + reach.t_f - scenario.controller.t_f
+    _check_steps(scenario, last_time, reach.smallest_period, substeps)
     if loop.clock == "flight":
-        made = clock.flight(reach.smallest_period, last)
+        run_clock = clock.flight_clock(reach.smallest_period, last_time)
     else:
-        late = scenario.end - scenario.controller.t_f + reach.delta
-        made = clock.anchored(reach.smallest_period, scenario.end, reach.t_f, late)
-    return dataclasses.replace(made, period=vector(loop.period), t_end=vector(scenario.end)), substeps
+        time_from_hand_over = scenario.end - scenario.controller.t_f + reach.delta
+        run_clock = clock.anchored_clock(reach.smallest_period, scenario.end, reach.t_f, time_from_hand_over)
+    return dataclasses.replace(run_clock, period=vector(loop.period), t_end=vector(scenario.end)), substeps
 
 
-def steps(parts: Parts) -> int:
+def count_steps(parts: Parts) -> int:
     """Return the number of integration steps of a run."""
     return parts.clock.count * parts.substeps
 
 
-def _check_steps(scenario: Scenario, last: float, period: float, substeps: int) -> None:
-    """Raise ScenarioError if a sampled run until `last` [s] needs more than `MOST_STEPS` integration steps."""
-    needed = last / period * substeps
+def _check_steps(scenario: Scenario, last_time: float, period: float, substeps: int) -> None:
+    """Raise ScenarioError if a sampled run until `last_time` [s] needs more than `MOST_STEPS` integration steps."""
+    needed = last_time / period * substeps
     if needed > MOST_STEPS:
-        asks = (
+        reason = (
             f"the sampled loop would take {needed:.6g} steps, {substeps} a period, and at most {MOST_STEPS} are allowed"
         )
-        if last > scenario.end:
-            raise ScenarioError(f"tune.bounds.t_f asks for runs of {last:.6g} s, but must be lower: {asks}")
-        raise wrong("loop.t_end", scenario.loop.t_end, f"earlier: {asks}")
+        if last_time > scenario.end:
+            raise ScenarioError(f"tune.bounds.t_f asks for runs of {last_time:.6g} s, but must be lower: {reason}")
+        raise wrong("loop.t_end", scenario.loop.t_end, f"earlier: {reason}")
 
 
-def _frequencies(scenario: Scenario, setup: Setup, reach: Reach) -> dict[str, float]:
+def _frequencies_by_key(scenario: Scenario, setup: Setup, reach: Reach) -> dict[str, float]:
     """Return the angular frequencies of disturbance and plant [rad/s], by the key that causes each of them."""
-    disturbed = {"disturbance.frequency": max(term.quickest() for term in scenario.terms)}
+    disturbed = {"disturbance.frequency": max(term.largest_frequency() for term in scenario.terms)}
     return disturbed | scenario.frequencies(setup, reach.smallest_t_f)
 
 
-def _fastest(frequencies: Mapping[str, float]) -> float:
+def _fastest_frequency(frequencies: Mapping[str, float]) -> float:
     """Return the highest angular frequency of the motion [rad/s]: of the disturbance, or the sum of all others."""
     others = sum(value for key, value in frequencies.items() if key != "disturbance.frequency")
     return max(frequencies["disturbance.frequency"], others)
 
 
-def _substeps(scenario: Scenario, period: float, frequencies: Mapping[str, float]) -> int:
+def _count_substeps(scenario: Scenario, period: float, frequencies: Mapping[str, float]) -> int:
     """Return the number of integration steps in a control period [s].
 
     RK4 with 0.025 rad per step has an error of about 1e-9 rad over 100 s. For disturbances, flexible modes and custom
     systems, 0.1 rad per step gives a relative error of about 1e-7. A torque that changes within the period, because of
     a lag or a rate limit, needs no further steps: its impulse and first moment are exact, see `Actuators.over`.
     """
-    frequencies = {key: value / (4 if key in _SMOOTHED else 1) for key, value in frequencies.items()}
-    needed = period * _fastest(frequencies) / 0.025
+    frequencies = {key: value / (4 if key in _SMOOTH_MOTIONS else 1) for key, value in frequencies.items()}
+    needed = period * _fastest_frequency(frequencies) / 0.025
     if needed > MOST_SUBSTEPS:
-        asks = f"loop.period = {period} would take more than {MOST_SUBSTEPS} integration steps a period"
-        raise _lower(scenario, max(frequencies, key=lambda key: frequencies[key]), asks)
-    steps = max(1, math.ceil(needed))
+        reason = f"loop.period = {period} would take more than {MOST_SUBSTEPS} integration steps a period"
+        raise _too_fast_error(scenario, max(frequencies, key=lambda key: frequencies[key]), reason)
+    count = max(1, math.ceil(needed))
     # round up to a power of 2 or 1.5 times one: nearly all gains then share one compiled program
-    power = 2 ** (steps.bit_length() - 1)
-    return next(allowed for allowed in (power, power + power // 2, 2 * power) if allowed >= steps)
+    power = 2 ** (count.bit_length() - 1)
+    return next(allowed for allowed in (power, power + power // 2, 2 * power) if allowed >= count)
 
 
-def _lower(scenario: Scenario, key: str, asks: str) -> ScenarioError:
+def _too_fast_error(scenario: Scenario, key: str, reason: str) -> ScenarioError:
     if key == "plant.system":
-        return ScenarioError(f"plant.system is too fast, in its own modes or in time: {asks}")
+        return ScenarioError(f"plant.system is too fast, in its own modes or in time: {reason}")
     table, _, name = key.partition(".")
     if name == "code":
-        return ScenarioError(f"{key} says that it is too fast: {asks}")
+        return ScenarioError(f"{key} says that it is too fast: {reason}")
     if key in ("reference.file", "reference.kind"):
         shown = show(getattr(getattr(scenario, table), name))
-        return ScenarioError(f"{key} is {shown}, whose attitude is too fast: {asks}")
+        return ScenarioError(f"{key} is {shown}, whose attitude is too fast: {reason}")
     if key == "controller.eta":  # blame t_f, because eta may be at its lower bound already
         eta = f"with controller.eta = {scenario.controller.eta}"
         shorter = ", or loop.period shorter" if scenario.sampled else ""
-        return wrong("controller.t_f", scenario.controller.t_f, f"longer {eta}{shorter}: {asks}")
+        return wrong("controller.t_f", scenario.controller.t_f, f"longer {eta}{shorter}: {reason}")
     *tables, name = name.split(".")
     value = getattr(functools.reduce(getattr, tables, getattr(scenario, table)), name, None)
     if value is None:  # the key belongs to terms of a sum of disturbances
         value = [getattr(term, name) for term in scenario.terms if hasattr(term, name)]
     if value == []:
-        return ScenarioError(f"{table} is too fast: {asks}")
-    return wrong(key, value, f"{'longer' if key in ('reference.duration', 'controller.t_f') else 'lower'}: {asks}")
+        return ScenarioError(f"{table} is too fast: {reason}")
+    return wrong(key, value, f"{'longer' if key in ('reference.duration', 'controller.t_f') else 'lower'}: {reason}")
 
 
 @programs.jit  # compiled as one program instead of one for each operation
-def _boundary_layer(controller: Any, observer: Any, visited: Any) -> tuple:
+def _layer_rates(controller: Any, observer: Any, visited: Any) -> tuple:
     """Return the fastest rates in the boundary layer before and after the hand-over [1/s]."""
     return rates.boundary_layer(controller, observer.error_bound().largest, visited)
 
 
-def _with_papers_law(setup: Setup) -> Setup:
+def _with_prescribed_time_law(setup: Setup) -> Setup:
     """Return the parts with the prescribed-time law. Its exact motion represents the states of a run under any law."""
     law = setup.controller
     if law.prescribed:
@@ -210,37 +213,37 @@ def _with_papers_law(setup: Setup) -> Setup:
 
 
 @programs.jit
-def _rates_of_system(setup: Setup, visited: tuple) -> tuple:
+def _system_rates(setup: Setup, visited: tuple) -> tuple:
     """Return Jacobians of a custom system at the visited states, and w' and w'' of the motion with zero error."""
     plant, kinematics = typing.cast(System, setup.plant), setup.controller.kinematics
-    none = jnp.zeros(plant.inputs)
+    zero = jnp.zeros(plant.inputs)
 
     def jacobian(t: Any, x: Any) -> Any:
-        u = kinematics.invert(x, t, none, none)
+        u = kinematics.invert(x, t, zero, zero)
         return plant.jacobian(t, plant.with_hidden_at_rest(x), u)
 
-    def along(t: Any) -> Any:
-        return plant_motion(kinematics, t, setup.initial, (none, none, none)).w_dot
+    def zero_error_acceleration(t: Any) -> Any:
+        return plant_motion(kinematics, t, setup.initial, (zero, zero, zero)).w_dot
 
     times = setup.t_end * jnp.linspace(0.0, 1.0, 509)  # 509 is prime, so that the samples rarely alias with a period
-    steady = lapack.vmap(lambda t: jax.jvp(along, (t,), (jnp.ones_like(t),)))(times)
+    steady = lapack.vmap(lambda t: jax.jvp(zero_error_acceleration, (t,), (jnp.ones_like(t),)))(times)
     return lapack.vmap(jacobian)(*visited), steady
 
 
-def _fastest_of_system(setup: Setup, visited: tuple) -> float:
+def _fastest_system_rate(setup: Setup, visited: tuple) -> float:
     """Return the fastest rate of a custom system along its run [rad/s], from its modes and its explicit time."""
-    jacobians, (acceleration, change) = _rates_of_system(solutions.bare(setup), visited)
+    jacobians, (acceleration, jerk) = _system_rates(solutions.without_devices(setup), visited)
     matrices = np.asarray(jacobians)
     modes = np.abs(np.linalg.eigvals(matrices[np.all(np.isfinite(matrices), axis=(1, 2))])).max(initial=0.0)
-    size, quick = (float(np.nanmax(np.abs(v), initial=0.0)) for v in (acceleration, change))
-    return float(max(modes, quick / size if size > 1e-12 else 0.0))
+    largest_acceleration, largest_jerk = (float(np.nanmax(np.abs(v), initial=0.0)) for v in (acceleration, jerk))
+    return float(max(modes, largest_jerk / largest_acceleration if largest_acceleration > 1e-12 else 0.0))
 
 
 def _with_gain(observer: Any, gain: float) -> Any:
     return dataclasses.replace(observer, gain=vector(np.full(np.shape(observer.gain), gain)))
 
 
-def _fastest_layer(reach: Reach, law: Any, observer: Any, visited: Any) -> tuple[float, float]:
+def _fastest_layer_rates(reach: Reach, law: Any, observer: Any, visited: Any) -> tuple[float, float]:
     """Return the fastest rates of boundary layer and observer before and after the hand-over, within reach [1/s]."""
     before = after = 0.0
     if hasattr(observer, "gain"):  # the smallest gain gives the largest K2, the largest gain the fastest observer
@@ -248,12 +251,12 @@ def _fastest_layer(reach: Reach, law: Any, observer: Any, visited: Any) -> tuple
         observer = _with_gain(observer, reach.gain)
     if reach.sign_width > 0.0:
         for t_f in (reach.smallest_t_f, reach.t_f):
-            layer = _boundary_layer(dataclasses.replace(law, t_f=vector(t_f)), observer, visited)
+            layer = _layer_rates(dataclasses.replace(law, t_f=vector(t_f)), observer, visited)
             before, after = max(before, float(layer[0])), max(after, float(layer[1]))
     return before, after
 
 
-def _grid(
+def _continuous_grid(
     scenario: Scenario, reach: Reach, setup: Setup, saves: object, frequencies: Mapping[str, float], visited: Any
 ) -> clock.Graded:
     """Return the grid of the continuous loop; raise ScenarioError if it needs more than `MOST_STEPS` steps."""
@@ -261,28 +264,32 @@ def _grid(
     t_end = scenario.end + reach.t_f - scenario.controller.t_f
     saves = (*np.ravel(np.asarray(saves, dtype=float)), *setup.observer.nodes())
     names = ("t_f", "k1", "sign_width", "surface_rate")
-    widest = dataclasses.replace(setup.controller, **{name: vector(getattr(reach, name)) for name in names})
-    layer = _fastest_layer(reach, widest, setup.observer, visited)
-    decays, frequency, order = rates.hold_rates(widest), _fastest(frequencies), scenario.grid_order
+    fastest_law = dataclasses.replace(setup.controller, **{name: vector(getattr(reach, name)) for name in names})
+    layer_rates = _fastest_layer_rates(reach, fastest_law, setup.observer, visited)
+    decay_rates, frequency, order = rates.hold_rates(fastest_law), _fastest_frequency(frequencies), scenario.grid_order
 
-    def steps(frequency: float = 0.0, layer: tuple[float, float] = (0.0, 0.0), rate: float = 0.0) -> float:
-        taken = sum(clock.graded_steps(reach.t_f, reach.smallest_delta, t_end, rate, frequency, layer, order))
-        return taken if taken == taken else math.inf
+    def steps_for(frequency: float = 0.0, layer: tuple[float, float] = (0.0, 0.0), rate: float = 0.0) -> float:
+        total = sum(clock.graded_steps(reach.t_f, reach.smallest_delta, t_end, rate, frequency, layer, order))
+        return total if total == total else math.inf
 
-    rate = max(decays.values())
-    needed = steps(frequency, layer, rate)
+    rate = max(decay_rates.values())
+    needed = steps_for(frequency, layer_rates, rate)
     if not needed <= MOST_STEPS:
-        asks = f"the continuous loop would need {needed:.6g} steps, and at most {MOST_STEPS} are allowed"
-        by_key = {key: steps(value) for key, value in frequencies.items()}
-        by_key |= {f"controller.{key}": steps(rate=value) for key, value in decays.items()}
-        by_key["controller.sign_width"] = steps(layer=layer)
-        worst = max(by_key, key=lambda key: by_key[key])
-        if not by_key["disturbance.frequency"] <= MOST_STEPS:  # the switching term gets faster with it, too
-            worst = "disturbance.frequency"
-        if by_key[worst] <= steps() * 1.5:
-            raise wrong("loop.t_end", t_end, f"earlier: {asks}")
-        if worst == "controller.sign_width":
-            raise wrong(worst, scenario.controller.sign_width, f"larger, or 0 for the discontinuous sign: {asks}")
-        raise _lower(scenario, worst, asks)
-    grid = clock.graded(reach.t_f, reach.smallest_delta, t_end, scenario.window, rate, frequency, layer, saves, order)
+        reason = f"the continuous loop would need {needed:.6g} steps, and at most {MOST_STEPS} are allowed"
+        steps_by_key = {key: steps_for(value) for key, value in frequencies.items()}
+        steps_by_key |= {f"controller.{key}": steps_for(rate=value) for key, value in decay_rates.items()}
+        steps_by_key["controller.sign_width"] = steps_for(layer=layer_rates)
+        main_cause = max(steps_by_key, key=lambda key: steps_by_key[key])
+        if not steps_by_key["disturbance.frequency"] <= MOST_STEPS:  # the switching term gets faster with it, too
+            main_cause = "disturbance.frequency"
+        if steps_by_key[main_cause] <= steps_for() * 1.5:
+            raise wrong("loop.t_end", t_end, f"earlier: {reason}")
+        if main_cause == "controller.sign_width":
+            raise wrong(
+                main_cause, scenario.controller.sign_width, f"larger, or 0 for the discontinuous sign: {reason}"
+            )
+        raise _too_fast_error(scenario, main_cause, reason)
+    grid = clock.graded_clock(
+        reach.t_f, reach.smallest_delta, t_end, scenario.window, rate, frequency, layer_rates, saves, order
+    )
     return dataclasses.replace(grid, t_end=vector(loop.t_end))

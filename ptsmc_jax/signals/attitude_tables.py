@@ -1,4 +1,7 @@
-"""A reference attitude that interpolates samples with continuous rate and acceleration. Start with `interpolated`."""
+"""A reference attitude that interpolates samples, with continuous rate and acceleration.
+
+Start with `interpolate_attitude`.
+"""
 
 from dataclasses import dataclass
 
@@ -11,10 +14,10 @@ from ptsmc_jax.numerics import attitude
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree, vector
 from ptsmc_jax.signals.references import Reference, Target
 
-MOST_INTERVALS = 1_000_000  # of the search table, so that it needs at most 4 MB
-ENDS = 5  # samples that determine the rate at an end; its error is then proportional to h^4, as at other samples
-CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])  # times a unit quaternion: the inverse rotation
-LARGEST_TURN = np.pi / 2  # between two samples [rad]: a turn of pi has no unique direction
+MOST_INTERVALS = 1_000_000  # largest size of the search table, which then needs 4 MB
+END_SAMPLES = 5  # samples that determine the rate at an end, with an error proportional to h^4 as at other samples
+CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])  # factors that invert the rotation of a unit quaternion
+LARGEST_TURN = np.pi / 2  # largest rotation between two samples [rad], because a rotation by pi has no unique axis
 
 
 @pytree
@@ -31,7 +34,7 @@ class TableReference(Reference):
     times: Leaf  # (n,) increasing [s]
     samples: Leaf  # (n, 4) unit quaternions without jumps of their signs [-]
     slopes: Leaf  # (n, 4) time derivative of s at the samples [1/s]
-    first: Leaf  # (m,) for each of m equal intervals of time, the number of the last sample before it, int32
+    first: Leaf  # (m,) number of the last sample before each of m equal intervals of time, int32
     intervals: Leaf  # number of these intervals per second [1/s]
 
     def __call__(self, t: Scalar) -> Target:
@@ -65,47 +68,50 @@ def _entry(table: Array, k: Array) -> Array:
     return lax.dynamic_index_in_dim(table, k, keepdims=False, allow_negative_indices=False)
 
 
-def interpolated(times: np.ndarray, quaternions: np.ndarray, ends: np.ndarray | None = None) -> TableReference:
+def interpolate_attitude(times: np.ndarray, quaternions: np.ndarray, ends: np.ndarray | None = None) -> TableReference:
     """Return the reference through samples of an attitude.
 
     Args:
         times: (n,) increasing [s], n >= 2.
         quaternions: (n, 4) unit quaternions; their signs are made continuous.
-        ends: (2, 3) rates of the first and of the last sample in reference axes [rad/s]; None: those of the polynomials
-            through the first and the last `ENDS` samples.
+        ends: (2, 3) rates at the first and the last sample in reference axes [rad/s]; None: the rates of polynomials
+            through the first and the last `END_SAMPLES` samples.
     """
-    samples = continuous(quaternions)
-    count = intervals(times)
+    samples = with_continuous_signs(quaternions)
+    count = count_intervals(times)
     starts = times[0] + (times[-1] - times[0]) / count * np.arange(count)
-    first = np.clip(np.searchsorted(times, starts, side="right") - 1, 0, len(times) - 2)
+    last_sample_before = np.clip(np.searchsorted(times, starts, side="right") - 1, 0, len(times) - 2)
     return TableReference(
         vector([0.0, 0.0, 0.0, 1.0]), vector(times), vector(samples),
-        vector(_slopes(times, samples, ends)),
-        jnp.asarray(first.astype(np.int32)), vector(count / (times[-1] - times[0])),
+        vector(_spline_rates(times, samples, ends)),
+        jnp.asarray(last_sample_before.astype(np.int32)), vector(count / (times[-1] - times[0])),
     )  # fmt: skip
 
 
-def _slopes(times: np.ndarray, samples: np.ndarray, ends: np.ndarray | None) -> np.ndarray:
-    """Return the time derivatives (n, 4) [1/s] of the spline at its samples; see `interpolated`."""
+def _spline_rates(times: np.ndarray, samples: np.ndarray, ends: np.ndarray | None) -> np.ndarray:
+    """Return the time derivatives (n, 4) [1/s] of the spline at its samples; see `interpolate_attitude`."""
     from scipy.interpolate import CubicSpline, KroghInterpolator
 
     if ends is None:
-        sides = ((times[:ENDS], samples[:ENDS]), (times[-ENDS:][::-1], samples[-ENDS:][::-1]))
+        sides = (
+            (times[:END_SAMPLES], samples[:END_SAMPLES]),
+            (times[-END_SAMPLES:][::-1], samples[-END_SAMPLES:][::-1]),
+        )
         slopes = [KroghInterpolator(*side).derivative(side[0][0]) for side in sides]
     else:
-        slopes = [_slope(samples[k], ends[k]) for k in (0, -1)]
+        slopes = [_quaternion_rate(samples[k], ends[k]) for k in (0, -1)]
     return CubicSpline(times, samples, bc_type=[(1, slope) for slope in slopes])(times, 1)
 
 
-def rates(times: np.ndarray, samples: np.ndarray, ends: np.ndarray | None = None) -> np.ndarray:
+def sample_rates(times: np.ndarray, samples: np.ndarray, ends: np.ndarray | None = None) -> np.ndarray:
     """Return the rates (n, 3) [rad/s] at the samples in reference axes.
 
     Args:
         times: (n,) [s].
         samples: (n, 4) unit quaternions without jumps of their signs.
-        ends: see `interpolated`.
+        ends: see `interpolate_attitude`.
     """
-    return body_rates(samples, _slopes(times, samples, ends))
+    return body_rates(samples, _spline_rates(times, samples, ends))
 
 
 def body_rates(q: np.ndarray, q_dot: np.ndarray) -> np.ndarray:
@@ -114,17 +120,17 @@ def body_rates(q: np.ndarray, q_dot: np.ndarray) -> np.ndarray:
     return 2.0 * (s * v_dot - s_dot * v - np.cross(v, v_dot))
 
 
-def _slope(q: np.ndarray, w: np.ndarray) -> np.ndarray:
+def _quaternion_rate(q: np.ndarray, w: np.ndarray) -> np.ndarray:
     """Return the time derivative (4,) [1/s] of a quaternion (4,) that turns with the rate w (3,) [rad/s]."""
     return 0.5 * np.append(q[3] * w + np.cross(q[:3], w), -np.dot(q[:3], w))
 
 
-def continuous(quaternions: np.ndarray) -> np.ndarray:
-    """Return quaternions (n, 4) with the signs that make successive ones nearest to each other."""
+def with_continuous_signs(quaternions: np.ndarray) -> np.ndarray:
+    """Return quaternions (n, 4) with signs that do not jump from one to the next."""
     signs = np.where(np.einsum("ij,ij->i", quaternions[1:], quaternions[:-1]) < 0.0, -1.0, 1.0)
     return quaternions * np.cumprod(np.append(1.0, signs))[:, None]
 
 
-def intervals(times: np.ndarray) -> int:
-    """Return the number of equal intervals, so that each interval has at most one sample inside."""
+def count_intervals(times: np.ndarray) -> int:
+    """Return the number of equal intervals of time that have at most one sample each."""
     return int(np.ceil((times[-1] - times[0]) / np.min(np.diff(times)) * (1.0 + 1e-9)))

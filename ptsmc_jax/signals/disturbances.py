@@ -26,7 +26,7 @@ class Disturbance:
         """Return the disturbance (m,) [N m] at the time t [s] in the state x."""
         raise NotImplementedError
 
-    # for "phase" and "amplitude", the name of the field that a dispersion of this quantity changes
+    # the name of the field that a dispersion changes, for the quantities "phase" and "amplitude"
     drawn: ClassVar[Mapping[str, str]] = {}
 
     def fastest(self) -> float:
@@ -58,15 +58,15 @@ class Constant(Disturbance):
     drawn: ClassVar[Mapping[str, str]] = {"amplitude": "amplitude"}
 
     def __call__(self, t: Scalar, x: Any = None) -> Float[Array, " m"]:
-        """Disturbance at t [s], (m,) [N m]."""
+        """Return the disturbance at t [s], (m,) [N m]."""
         return self.amplitude
 
     def impulse(self, end: float) -> float:
-        """It acts all the time [N m s]."""
+        """Return |amplitude| times the duration [N m s]."""
         return float(np.linalg.norm(np.abs(self.amplitude) * end))
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Its size (m,) [N m]; it does not change."""
+        """Return its size (m,) [N m], and a rate of zero."""
         size = np.abs(self.amplitude)
         return size, np.zeros_like(size)
 
@@ -113,16 +113,16 @@ class Sinusoid(Disturbance):
         return self.bias + self.amplitude * sine
 
     def fastest(self) -> float:
-        """Its fastest component [rad/s]."""
+        """Return the largest angular frequency of its components [rad/s]."""
         return float(np.max(np.abs(self.frequency)))
 
     def impulse(self, end: float) -> float:
-        """Half a period at most, and the constant part [N m s]."""
-        lasting = np.minimum(end, 2.0 / np.maximum(np.abs(self.frequency), 1e-12))
-        return float(np.linalg.norm(np.abs(self.amplitude) * lasting) + np.linalg.norm(self.bias) * end)
+        """Return a bound on the impulse: that of half a period at most, plus that of the constant part [N m s]."""
+        effective_time = np.minimum(end, 2.0 / np.maximum(np.abs(self.frequency), 1e-12))
+        return float(np.linalg.norm(np.abs(self.amplitude) * effective_time) + np.linalg.norm(self.bias) * end)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """|bias| + |amplitude| and |amplitude frequency| of each component (m,) [N m, N m/s], at any phase."""
+        """Return |bias| + |amplitude| and |amplitude frequency| of each component (m,) [N m, N m/s], at any phase."""
         size = np.abs(self.amplitude)
         return np.abs(self.bias) + size, size * np.abs(self.frequency)
 
@@ -132,15 +132,13 @@ class Sinusoid(Disturbance):
 class GravityGradient(Disturbance):
     """The gravity gradient torque on the true body, on the orbit of [orbit] or else on a circular orbit.
 
-    The attitude key is that of the circular orbit's frame. The frame's z is along the orbit's normal, its x points to
-    where the phase counts from. The torque is 3 n^2 c x J c, c the unit vector to the planet in body axes.
-
-    c depends on the true attitude. Wie, Space Vehicle Dynamics and
-    Control (2008), eq. (6.128).
+    The torque is 3 n^2 c x J c, with the unit vector c to the planet in body axes, which depends on the true attitude
+    (Wie, Space Vehicle Dynamics and Control, 2008, eq. (6.128)). The attitude key defines the frame of the circular
+    orbit: z is the orbit normal, and x is the direction in which the phase is zero.
     """
 
     inertia: Leaf  # (3, 3) of the true body [kg m^2]
-    orbit: Leaf  # (4,) quaternion of the orbit's frame: z along its normal, x to where the phase counts from
+    orbit: Leaf  # (4,) quaternion of the orbit frame: z is the orbit normal, x the direction of phase zero
     orbit_rate: Leaf = number(
         None, above=0.0, at_most=1.0, unit="rad/s", meaning="mean motion n; default: 1.1e-3, or of [orbit]"
     )
@@ -148,7 +146,7 @@ class GravityGradient(Disturbance):
     drawn: ClassVar[Mapping[str, str]] = {"phase": "phase"}
 
     def __call__(self, t: Scalar, x: AttitudeState) -> Float[Array, "3"]:
-        """Torque at t [s] in the state x, (3,) [N m]."""
+        """Return the torque at t [s] in the state x, (3,) [N m]."""
         sine, cosine = _sin_cos_of_sum(self.orbit_rate * t, self.phase)
         radial = jnp.stack([cosine, sine, jnp.zeros_like(sine)])
         c = attitude.rotate(attitude.multiply(attitude.conjugate(x.q), self.orbit), radial)
@@ -161,16 +159,19 @@ class GravityGradient(Disturbance):
 @pytree
 @dataclass(frozen=True)
 class KeplerGravityGradient(Disturbance):
-    """The gravity gradient on a Keplerian orbit: 3 mu / r^3 c x J c, c the unit vector to the planet in body axes."""
+    """The gravity gradient torque on a Keplerian orbit, 3 mu / r^3 c x J c.
+
+    c is the unit vector to the planet in body axes.
+    """
 
     inertia: Leaf  # (3, 3) of the true body [kg m^2]
     orbit: Orbit
 
     def __call__(self, t: Scalar, x: AttitudeState) -> Float[Array, "3"]:
-        """Torque at t [s] in the state x, (3,) [N m]."""
-        place = self.orbit(t)
-        c = -attitude.rotate(attitude.conjugate(x.q), place.radial)
-        strength = 3.0 * self.orbit.rate() ** 2 * (self.orbit.semi_major_axis / place.radius) ** 3
+        """Return the torque at t [s] in the state x, (3,) [N m]."""
+        position = self.orbit(t)
+        c = -attitude.rotate(attitude.conjugate(x.q), position.radial)
+        strength = 3.0 * self.orbit.rate() ** 2 * (self.orbit.semi_major_axis / position.radius) ** 3
         return strength * attitude.cross(c, self.inertia @ c)
 
     def on_body(self, inertia: Float[Array, "3 3"]) -> Any:
@@ -220,7 +221,7 @@ def _field_values(disturbance: Any, quantity: str) -> list[Any]:
     return [getattr(term, field) for term, field in fields if field is not None]
 
 
-def count(disturbance: Any, quantity: Literal["phase", "amplitude"]) -> int:
+def count_values(disturbance: Any, quantity: Literal["phase", "amplitude"]) -> int:
     """Return the number of phases or amplitudes of a disturbance."""
     return sum(map(np.size, _field_values(disturbance, quantity)))
 
@@ -230,21 +231,21 @@ def values(disturbance: Any, quantity: Literal["phase", "amplitude"]) -> Float[A
     return jnp.concatenate([jnp.zeros(0), *map(jnp.ravel, _field_values(disturbance, quantity))])
 
 
-def with_values(disturbance: Any, quantity: Literal["phase", "amplitude"], new: Float[Array, " count"]) -> Any:
+def with_values(disturbance: Any, quantity: Literal["phase", "amplitude"], new_values: Float[Array, " count"]) -> Any:
     """Return the disturbance with other phases or amplitudes. Terms without them are not changed.
 
     Args:
         disturbance: the disturbance.
         quantity: which values to replace.
-        new: new phases [rad] or amplitudes [N m], (count,), in the order of `values`.
+        new_values: new phases [rad] or amplitudes [N m], (count,), in the order of `values`.
     """
-    changed, used = [], 0
+    changed, offset = [], 0
     for term in terms(disturbance):
         field = _field_name(term, quantity)
         if field is not None:
             old = jnp.asarray(getattr(term, field))
-            term = replace(term, **{field: new[used : used + old.size].reshape(old.shape)})
-            used += old.size
+            term = replace(term, **{field: new_values[offset : offset + old.size].reshape(old.shape)})
+            offset += old.size
         changed.append(term)
     return Sum(tuple(changed)) if isinstance(disturbance, Sum) else changed[0]
 

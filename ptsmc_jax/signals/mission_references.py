@@ -19,7 +19,7 @@ from ptsmc_jax.signals.references import Reference, Target, target_of
 
 @dataclass(frozen=True)
 class MissionReference(Reference):
-    """Base: q_f(t) = frame(t) mount q, with the quaternion of a moving frame and two constant rotations.
+    """Base of mission references: q_f(t) = frame(t) mount q, with a moving frame and two constant rotations.
 
     The attitude q is the identity, unless dispersions turn it.
     """
@@ -58,7 +58,7 @@ class TwoVectorReference(MissionReference):
     primary: Any  # an `orbits.Direction`
     secondary: Any
     orbit: Any  # `orbits.Orbit`, or None if no direction depends on it
-    anchors: Leaf  # (n, 4) quaternions of the frame, without jumps of their signs, see `anchored`
+    anchors: Leaf  # (n, 4) quaternions of the frame, without jumps of their signs, see `anchor_quaternions`
     anchor_rate: Leaf  # number of anchors per second [1/s]
 
     def matrix(self, t: Any, xp: Any = jnp) -> Any:
@@ -77,8 +77,10 @@ class TwoVectorReference(MissionReference):
 
     def directions(self, t: Any, xp: Any = jnp) -> tuple[Any, Any]:
         """Return the primary and the secondary direction, unit vectors (.., 3) in inertial axes; see `matrix`."""
-        place = None if self.orbit is None else self.orbit(t, xp)
-        primary, secondary = (orbits.unit(one(t, place, self.orbit, xp)) for one in (self.primary, self.secondary))
+        position = None if self.orbit is None else self.orbit(t, xp)
+        primary, secondary = (
+            orbits.unit(direction(t, position, self.orbit, xp)) for direction in (self.primary, self.secondary)
+        )
         return primary, secondary
 
     def frame(self, t: Scalar) -> Float[Array, "4"]:
@@ -96,13 +98,13 @@ class GroundTargetReference(TwoVectorReference):
 def quaternion_near(matrix: Float[Array, "3 3"], anchor: Float[Array, "4"]) -> Float[Array, "4"]:
     """Return the quaternion (4,) of a rotation matrix (3, 3) with the sign that is nearer to another quaternion (4,).
 
-    The matrix q q' is linear in the rotation matrix, and q q' a = q (q.a). So the result has no branches. It is smooth
-    unless the two attitudes are 180 degrees apart.
+    The matrix q q' is linear in the rotation matrix, and q q' a = q (q.a). The result therefore has no branches. It is
+    smooth unless the two attitudes are 180 degrees apart.
     """
     v, s = anchor[:3], anchor[3]
     trace = matrix[0, 0] + matrix[1, 1] + matrix[2, 2]
-    off = matrix - matrix.T
-    axial = jnp.stack([off[2, 1], off[0, 2], off[1, 0]])
+    antisymmetric = matrix - matrix.T
+    axial = jnp.stack([antisymmetric[2, 1], antisymmetric[0, 2], antisymmetric[1, 0]])
     vector = (matrix + matrix.T) @ v + (1.0 - trace) * v + s * axial
     return attitude.normalise(jnp.append(vector, jnp.dot(axial, v) + (1.0 + trace) * s))
 
@@ -135,14 +137,14 @@ def nadir_mounting(primary: object, secondary: object) -> np.ndarray:
     return (Rotation.from_quat(orbit_to_frame).inv() * Rotation.from_quat(to_frame)).as_quat()
 
 
-def turns(matrices: np.ndarray) -> np.ndarray:
+def successive_rotations(matrices: np.ndarray) -> np.ndarray:
     """Return the rotation vectors (n - 1, 3) [rad] from each rotation matrix of (n, 3, 3) to the next one."""
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_matrix(np.swapaxes(matrices[:-1], 1, 2) @ matrices[1:]).as_rotvec()
 
 
-def anchored(matrices: np.ndarray) -> np.ndarray:
+def anchor_quaternions(matrices: np.ndarray) -> np.ndarray:
     """Return quaternions (n, 4) of rotation matrices (m, 3, 3) at equal intervals of time, without jumps of sign.
 
     Each anchor is the attitude at the start of one of n equal intervals. m and n are powers of two. n is the smallest
@@ -150,7 +152,7 @@ def anchored(matrices: np.ndarray) -> np.ndarray:
     """
     from scipy.spatial.transform import Rotation
 
-    q = attitude_tables.continuous(Rotation.from_matrix(matrices).as_quat())
+    q = attitude_tables.with_continuous_signs(Rotation.from_matrix(matrices).as_quat())
     count = 1
     while count < len(q):
         intervals = q.reshape(count, -1, 4)

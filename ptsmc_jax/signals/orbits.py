@@ -3,7 +3,7 @@
 The inertial frame has its x axis at the vernal equinox and its z axis along the Earth's rotation axis. Precession,
 nutation, polar motion and orbit perturbations are neglected. Start with `Orbit`.
 
-The functions also run in NumPy, because reading a scenario must not start JAX: defaults follow from the first attitude.
+The functions also run in NumPy. Reading a scenario needs the first attitude for its defaults, and must not start JAX.
 """
 
 from dataclasses import dataclass
@@ -22,8 +22,8 @@ EARTH_RATE = 7.292115e-5  # rotation rate of the Earth, WGS-84 [rad/s]
 EQUATORIAL_RADIUS, FLATTENING = 6_378_137.0, 1.0 / 298.257223563  # WGS-84 ellipsoid [m, -]
 DAY = 86_400.0  # [s]
 OBLIQUITY = np.deg2rad(23.4392911)  # angle between ecliptic and equator at J2000 [rad]
-ITERATIONS = 4  # steps that solve Kepler's equation up to rounding, for eccentricities of at most 0.9
-DIFFERENTIATED = 2  # further steps. Only these are differentiated.
+HALLEY_ITERATIONS = 4  # these solve Kepler's equation up to rounding, for eccentricities of at most 0.9
+NEWTON_ITERATIONS = 2  # further iterations; only these are differentiated
 
 
 class Place(NamedTuple):
@@ -103,10 +103,10 @@ class Orbit:
             0.5 * self.inclination,
             0.5 * (self.perigee + self.anomalies(t)[0]),
         )
-        plane = jnp.stack([jnp.sin(tilt) * jnp.cos(node), jnp.sin(tilt) * jnp.sin(node),
+        orbit_plane = jnp.stack([jnp.sin(tilt) * jnp.cos(node), jnp.sin(tilt) * jnp.sin(node),
                            jnp.cos(tilt) * jnp.sin(node), jnp.cos(tilt) * jnp.cos(node)])  # fmt: skip
         zero = jnp.zeros_like(half)
-        return attitude.multiply(plane, jnp.stack([zero, zero, jnp.sin(half), jnp.cos(half)]))
+        return attitude.multiply(orbit_plane, jnp.stack([zero, zero, jnp.sin(half), jnp.cos(half)]))
 
 
 def cross(a: Any, b: Any) -> Any:
@@ -124,16 +124,16 @@ def unit(v: Any) -> Any:
 def _eccentric_less_mean(mean: Any, e: Any, xp: Any) -> Any:
     """Return E - M [rad] of Kepler's equation.
 
-    Halley's iterations start at Danby's value (Celestial Mechanics 40, 1987). They are constants of differentiation.
-    Newton's iterations follow. `DIFFERENTIATED` = 2 of them give three correct derivatives.
+    Halley's iterations start at Danby's value (Celestial Mechanics 40, 1987). They are not differentiated.
+    Newton's iterations follow. `NEWTON_ITERATIONS` = 2 of them give three correct derivatives.
     """
     d = 0.85 * e * xp.sign(xp.sin(mean))
-    for _ in range(ITERATIONS):
+    for _ in range(HALLEY_ITERATIONS):
         sine, slope = e * xp.sin(mean + d), 1.0 - e * xp.cos(mean + d)
         step = (d - sine) / slope
         d = d - step / (1.0 - 0.5 * step * sine / slope)
     d = lax.stop_gradient(d) if xp is jnp else d
-    for _ in range(DIFFERENTIATED):
+    for _ in range(NEWTON_ITERATIONS):
         d = d - (d - e * xp.sin(mean + d)) / (1.0 - e * xp.cos(mean + d))
     return d
 
@@ -148,11 +148,11 @@ def mean_anomaly(true_anomaly: float, eccentricity: float) -> float:
 
 def ground_point(latitude: float, longitude: float, height: float) -> np.ndarray:
     """Return Earth-fixed coordinates (3,) [m] of geodetic latitude and longitude [rad] and height [m] on WGS-84."""
-    square = FLATTENING * (2.0 - FLATTENING)  # of the first eccentricity
-    normal = EQUATORIAL_RADIUS / np.sqrt(1.0 - square * np.sin(latitude) ** 2)
-    across = (normal + height) * np.cos(latitude)
-    up = (normal * (1.0 - square) + height) * np.sin(latitude)
-    return np.array([across * np.cos(longitude), across * np.sin(longitude), up])
+    eccentricity_squared = FLATTENING * (2.0 - FLATTENING)  # square of the first eccentricity
+    normal = EQUATORIAL_RADIUS / np.sqrt(1.0 - eccentricity_squared * np.sin(latitude) ** 2)
+    equatorial = (normal + height) * np.cos(latitude)
+    polar = (normal * (1.0 - eccentricity_squared) + height) * np.sin(latitude)
+    return np.array([equatorial * np.cos(longitude), equatorial * np.sin(longitude), polar])
 
 
 def earth_angle(days: float) -> float:
@@ -250,7 +250,7 @@ class Sun(Direction):
         return xp.stack([xp.cos(ecliptic), np.cos(OBLIQUITY) * sine, np.sin(OBLIQUITY) * sine], axis=-1)
 
 
-def sun(days: float) -> Sun:
+def sun_direction(days: float) -> Sun:
     """Return the direction to the Sun for days since J2000 at t = 0."""
     turn = 2.0 * np.pi
     return Sun(np.deg2rad(280.460 + 0.9856474 * days) % turn, np.deg2rad(357.528 + 0.9856003 * days) % turn)

@@ -30,7 +30,7 @@ class Target(NamedTuple):
 
 
 def target_of(path: Callable[[Scalar], Float[Array, "4"]], t: Scalar) -> Target:
-    """Target at t [s] of an attitude path, a unit quaternion as a function of time; its derivatives are exact.
+    """Return the target at t [s] of an attitude path, which is a unit quaternion as a function of time.
 
     Rates are exact, by automatic differentiation: w = 2 vec(q* q') and w' = 2 vec(q* q''), because the product
     q*' q' = |q'|^2 has no vector part.
@@ -71,8 +71,8 @@ class TurningFunction(Function):
 class Reference:
     """Base of references that define an attitude as a function of time, also of custom ones: q_f(t) = q attitude(t)."""
 
-    q: Leaf  # (4,) the attitude that it turns from
-    paced_by: ClassVar[str] = "code"  # the key that says how fast it turns and changes
+    q: Leaf  # (4,) attitude from which the reference rotates
+    paced_by: ClassVar[str] = "code"  # scenario key that determines how fast the reference rotates
 
     def attitude(self, t: Scalar) -> Float[Array, "4"]:
         """Return the unit quaternion (4,) [-] at the time t [s]. It must be twice differentiable for the rates."""
@@ -90,35 +90,35 @@ class Reference:
 @pytree
 @dataclass(frozen=True)
 class Fixed(Reference):
-    """An attitude to be held."""
+    """A constant attitude."""
 
     def __call__(self, t: Scalar) -> Target:
-        """Target at t [s]."""
+        """Return the target at t [s]."""
         return Target(self.q, jnp.zeros(3), jnp.zeros(3))
 
 
 @pytree
 @dataclass(frozen=True)
 class Spin(Reference):
-    """The attitude at t = 0, turning from then on at a constant body rate: q_f(t) = q(0) exp(w t)."""
+    """A rotation at a constant body rate from the attitude at t = 0: q_f(t) = q(0) exp(w t)."""
 
     rate: Leaf = number((0.0, 0.0, 0.0), unit="rad/s", meaning="rate of the reference, in its own axes")
     paced_by: ClassVar[str] = "rate"
 
     def __call__(self, t: Scalar) -> Target:
-        """Target at t [s]."""
+        """Return the target at t [s]."""
         turned = attitude.multiply(self.q, attitude.from_rotation_vector(self.rate * t))
         return Target(turned, self.rate, jnp.zeros(3))
 
     def fastest(self) -> float:
-        """Its rate [rad/s]."""
+        """Return its rate [rad/s]."""
         return float(np.linalg.norm(self.rate))
 
 
 @pytree
 @dataclass(frozen=True)
 class Swing(Reference):
-    """On top of the attitude, the rotation vector r = amplitude sin(frequency t + phase), axis by axis.
+    """An oscillation about the attitude, with the rotation vector r = amplitude sin(frequency t + phase) per axis.
 
     q_f(t) = q exp(r(t)).
     """
@@ -131,7 +131,7 @@ class Swing(Reference):
     paced_by: ClassVar[str] = "frequency"
 
     def fastest(self) -> float:
-        """Its largest rate, and the fastest axis [rad/s]."""
+        """Return its largest rate plus its largest angular frequency [rad/s]."""
         turning = float(np.linalg.norm(np.multiply(self.amplitude, self.frequency)))
         return turning + float(np.max(np.abs(self.frequency)))
 
@@ -142,19 +142,19 @@ class Swing(Reference):
 @pytree
 @dataclass(frozen=True)
 class Slew(Reference):
-    """From the attitude, at rest, to another one, at rest, about one axis: q_f(t) = q exp(f(t / duration) turn).
+    """A slew about one axis, from rest to rest: q_f(t) = q exp(f(t / duration) turn).
 
     The fraction f(x) = 10 x^3 - 15 x^4 + 6 x^5 rises from 0 to 1, with zero first and second derivatives at both ends.
     """
 
-    turn: Leaf  # (3,) rotation vector from the attitude at t = 0 to that from t = duration on [rad]
+    turn: Leaf  # (3,) rotation vector from the attitude at t = 0 to the attitude at t = duration and later [rad]
     duration: Leaf = number(
         Scaled(30.0, time=1), above=0.0, unit="s", meaning="duration of the slew; default: 30, scaled to the mission"
     )
     paced_by: ClassVar[str] = "duration"
 
     def fastest(self) -> float:
-        """The largest rate of the quintic, and the motion's own time [rad/s]."""
+        """Return the largest rate of the quintic plus 2 pi / duration [rad/s]."""
         turning = 1.875 * float(np.linalg.norm(self.turn))
         return (turning + 2.0 * np.pi) / float(self.duration)
 

@@ -69,30 +69,30 @@ class Setup:
         """
         body = spacecraft(inertia)
 
-        def changed(plant: Any, name: str) -> Any:
+        def with_new_inertia(plant: Any, name: str) -> Any:
             if not hasattr(plant, "with_inertia"):
                 raise ValueError(f"the {name} is a {type(plant).__name__}, but with_inertia needs a spacecraft")
             return plant.with_inertia(body.inertia, body.inertia_inverse)
 
-        acting = disturbances.on_body(self.disturbance, body.inertia)
-        changes = {"plant": changed(self.plant, "plant"), "disturbance": acting}
+        disturbance_on_body = disturbances.on_body(self.disturbance, body.inertia)
+        changes = {"plant": with_new_inertia(self.plant, "plant"), "disturbance": disturbance_on_body}
         if known:
             law, observer = self.controller, self.observer
-            kinematics = replace(law.kinematics, model=changed(law.model, "model of the controller"))
+            kinematics = replace(law.kinematics, model=with_new_inertia(law.model, "model of the controller"))
             changes["controller"] = replace(law, kinematics=kinematics)
             if hasattr(observer, "model"):
-                changes["observer"] = replace(observer, model=changed(observer.model, "model of the observer"))
+                changes["observer"] = replace(observer, model=with_new_inertia(observer.model, "model of the observer"))
         return replace(self, **changes)
 
-    def timed(self, clock: Anchored | Flight | Graded, substeps: int) -> "Parts":
+    def with_clock(self, clock: Anchored | Flight | Graded, substeps: int) -> "Parts":
         """Return the parts of a run with this clock and number of integration steps in a control period."""
         return Parts(clock=clock, substeps=substeps, **{f.name: getattr(self, f.name) for f in fields(self)})
 
 
-def check_parts(what: object) -> None:
+def check_parts(value: object) -> None:
     """Raise TypeError if the argument is not the parts of a run."""
-    if not isinstance(what, Setup):
-        raise TypeError(f"parts are needed, such as study(scenario).parts, but this is a {type(what).__name__}")
+    if not isinstance(value, Setup):
+        raise TypeError(f"parts are needed, such as study(scenario).parts, but this is a {type(value).__name__}")
 
 
 @pytree

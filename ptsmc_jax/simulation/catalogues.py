@@ -28,30 +28,31 @@ INDICES = {
     "rke": "RKE, the error of the attitude that the law is given less its window's mean",
 }
 AXES = {"x": "about x", "y": "about y", "z": "about z", "boresight": "half-cone of the boresight"}
-TIMED = ("ape", "mpe", "rpe", "ake", "mke", "rke")  # indices that a limit on a fraction of the time may use
-RELATIVE = ("rpe", "rke")  # indices of TIMED that need the stored samples of a window
-AT_A_TIME = tuple(f"{index}_{axis}" for index in TIMED for axis in AXES)
+# indices that a requirement may limit in a fraction of the time
+TIME_FRACTION_INDICES = ("ape", "mpe", "rpe", "ake", "mke", "rke")
+RELATIVE_INDICES = ("rpe", "rke")  # indices that need the stored samples of a window
+TIME_FRACTION_METRICS = tuple(f"{index}_{axis}" for index in TIME_FRACTION_INDICES for axis in AXES)
 WITHIN = "within_"  # prefix of the metric that is the fraction of the time within the limit of another metric
-# prefixes of metrics that only a run with measurement noise has
+# prefixes of the knowledge errors, which are metrics of runs with measurement noise only
 KNOWLEDGE = tuple(f"{prefix}{index}" for prefix in ("", WITHIN) for index in ("ake", "mke", "rke"))
 
 CATALOGUE = {
     **{name: Entry(metric.unit, metric.meaning, metric.table) for name, metric in METRICS.items()},
     **{
-        f"{index}_{axis}": Entry("rad", f"{what}, {where}: largest in the observation", "pointing")
-        for index, what in INDICES.items()
-        for axis, where in AXES.items()
+        f"{index}_{axis}": Entry("rad", f"{meaning}, {axis_meaning}: largest in the observation", "pointing")
+        for index, meaning in INDICES.items()
+        for axis, axis_meaning in AXES.items()
     },
     **{
         f"{WITHIN}{name}": Entry("-", f"fraction of the observation in which {name} is within its limit", "pointing")
-        for name in AT_A_TIME
+        for name in TIME_FRACTION_METRICS
     },
 }
 POINTING = tuple(name for name, entry in CATALOGUE.items() if entry.table == "pointing")
 # metrics of other plants, whose x_1 is the error, in the units of their states and inputs
 STATE_CATALOGUE = {name: Entry(*metric.of_states) for name, metric in METRICS.items() if metric.of_states is not None}
 MAY_BE_ZERO = ("saturated",)  # metrics that a requirement may limit to zero
-LARGER_IS_BETTER = tuple(f"{WITHIN}{name}" for name in AT_A_TIME)  # all other metrics are better if smaller
+LARGER_IS_BETTER = tuple(f"{WITHIN}{name}" for name in TIME_FRACTION_METRICS)  # all other metrics are better if smaller
 # units that a limit may be stated in, by the unit of its metric or key: name -> value in that unit
 UNITS: dict[str, dict[str, float]] = {
     "rad": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": math.pi / 180, "arcmin": math.pi / 10_800,

@@ -18,16 +18,17 @@ from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.numerics import guards
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree, vector
 
-COARSEST = 0.25  # longest step before the hand-over, divided by the time to go; it changes window_error by 5e-4
+# longest step before the hand-over, divided by the time to go; such steps change window_error by 5e-4
+LARGEST_STEP_FRACTION = 0.25
 
 
-def _not_above(t: Array, limit: Scalar, rounding: Scalar | float = 0.0) -> Array:
+def _limit_time(t: Array, limit: Scalar, rounding: Scalar | float = 0.0) -> Array:
     """Return min(t, limit), with the derivative of `limit` if they are equal within `time_tolerance`."""
     return jnp.where(t < limit - rounding, t, limit)
 
 
-def _full(t: Array, t_next: Array, hold: Array) -> Ticks:
-    """Return `Ticks` of intervals that are all full, with sample numbers from 0."""
+def _full_intervals(t: Array, t_next: Array, hold: Array) -> Ticks:
+    """Return the `Ticks` of complete intervals, with sample numbers from 0."""
     return Ticks(t, t_next, hold, jnp.arange(t.size, dtype=jnp.int32), jnp.ones_like(t), jnp.zeros_like(hold))
 
 
@@ -44,8 +45,8 @@ class Anchored:
 
     period: Leaf  # h [s]
     t_end: Leaf  # [s]
-    before: int = field(metadata={"static": True})  # samples before the hand-over, at least t_s / period
-    after: int = field(metadata={"static": True})  # samples from the hand-over on
+    before: int = field(metadata={"static": True})  # number of samples before the hand-over, at least t_s / period
+    after: int = field(metadata={"static": True})  # number of samples from the hand-over on
     sampled: ClassVar[bool] = True
     anchored: ClassVar[bool] = True
 
@@ -56,7 +57,7 @@ class Anchored:
 
     def long_enough_for(self, others: Sequence[Any]) -> "Anchored":
         """Return the clock with as many samples before and after the hand-over as the longest of these clocks."""
-        return replace(self, before=max(one.before for one in others), after=max(one.after for one in others))
+        return replace(self, before=max(clock.before for clock in others), after=max(clock.after for clock in others))
 
     def ticks(self, t_f: Scalar, delta: Scalar) -> Ticks:
         """Control periods for this prescribed time and delta [s]."""
@@ -64,11 +65,13 @@ class Anchored:
         # one array of nodes, so that each interval ends exactly where the next begins
         nominal = (t_f - delta) + jnp.arange(-self.before, self.after + 1).astype(float) * self.period
         # rounding may put the sample at t = 0 slightly after it; then there would be two samples
-        begun = nominal > guards.time_tolerance(self.period, t_f)
-        nodes = _not_above(jnp.where(begun, nominal, 0.0), self.t_end, guards.time_tolerance(self.period, self.t_end))
+        has_started = nominal > guards.time_tolerance(self.period, t_f)
+        nodes = _limit_time(
+            jnp.where(has_started, nominal, 0.0), self.t_end, guards.time_tolerance(self.period, self.t_end)
+        )
         t, t_next = nodes[:-1], nodes[1:]
         # the start of a period decides, because rounding may make its length equal to a full period or longer
-        partial = ~begun[:-1]
+        partial = ~has_started[:-1]
         fraction = jnp.where(partial, (t_next - t) / self.period, 1.0)
         return Ticks(t, t_next, sample >= 0, sample, fraction, partial)
 
@@ -86,15 +89,15 @@ class Flight:
 
     def long_enough_for(self, others: Sequence[Any]) -> "Flight":
         """Return the clock with as many samples as the longest of these clocks."""
-        return replace(self, count=max(one.count for one in others))
+        return replace(self, count=max(clock.count for clock in others))
 
     def ticks(self, t_f: Scalar, delta: Scalar) -> Ticks:
         """Control periods for this prescribed time and delta [s]."""
         nominal = jnp.arange(self.count + 1).astype(float) * self.period
-        nodes = _not_above(nominal, self.t_end, guards.time_tolerance(self.period, self.t_end))
+        nodes = _limit_time(nominal, self.t_end, guards.time_tolerance(self.period, self.t_end))
         t, t_next = nodes[:-1], nodes[1:]
         hold = t >= t_f - delta - guards.time_tolerance(self.period, t_f)  # rounding must not delay the hand-over
-        return _full(t, t_next, hold)
+        return _full_intervals(t, t_next, hold)
 
 
 @pytree
@@ -120,33 +123,39 @@ class Graded:
         return self.before + self.after
 
     def long_enough_for(self, others: Sequence[Any]) -> "Graded":
-        """Return the clock itself, because its number of steps follows from its accuracy."""
+        """Return the clock unchanged, because its accuracy determines its number of steps."""
         return self
 
     def ticks(self, t_f: Scalar, delta: Scalar) -> Ticks:
         """Integration steps for this prescribed time and delta [s]."""
         t_s = t_f - delta
-        early = self._graded(t_f, delta)
-        early = jnp.sort(jnp.concatenate([early, jnp.clip(self.saves, 0.0, t_s)]))
-        extra = jnp.stack([t_f, _not_above(t_f + self.window, self.t_end)])
-        late = t_s + (self.t_end - t_s) * jnp.arange(self.after + 1).astype(float) / self.after
-        late = late.at[-1].set(self.t_end)
-        late = jnp.sort(jnp.concatenate([late, extra, jnp.clip(self.saves, t_s, self.t_end)]))
-        t, t_next = jnp.concatenate([early[:-1], late[:-1]]), jnp.concatenate([early[1:], late[1:]])
-        hold = jnp.arange(t.size) >= early.size - 1
-        return _full(t, t_next, hold)
+        nodes_before = self._nodes_before_hand_over(t_f, delta)
+        nodes_before = jnp.sort(jnp.concatenate([nodes_before, jnp.clip(self.saves, 0.0, t_s)]))
+        further_nodes = jnp.stack([t_f, _limit_time(t_f + self.window, self.t_end)])
+        nodes_after = t_s + (self.t_end - t_s) * jnp.arange(self.after + 1).astype(float) / self.after
+        nodes_after = nodes_after.at[-1].set(self.t_end)
+        nodes_after = jnp.sort(jnp.concatenate([nodes_after, further_nodes, jnp.clip(self.saves, t_s, self.t_end)]))
+        t, t_next = (
+            jnp.concatenate([nodes_before[:-1], nodes_after[:-1]]),
+            jnp.concatenate([nodes_before[1:], nodes_after[1:]]),
+        )
+        hold = jnp.arange(t.size) >= nodes_before.size - 1
+        return _full_intervals(t, t_next, hold)
 
-    def too_coarse(self, t_f: Any, delta: Any, xp: Any = jnp) -> Any:
-        """Return whether steps are longer than `COARSEST` allows, as for twice the t_f of the grid. Times in [s]."""
-        return self._grading(t_f, delta, xp) < 1.0 / COARSEST
+    def is_too_coarse(self, t_f: Any, delta: Any, xp: Any = jnp) -> Any:
+        """Return whether steps are longer than `LARGEST_STEP_FRACTION` allows; t_f and delta in s.
 
-    def _grading(self, t_f: Any, delta: Any, xp: Any = jnp) -> Any:
+        This happens, for example, if t_f is twice the t_f that the grid was built for.
+        """
+        return self._grading_weight(t_f, delta, xp) < 1.0 / LARGEST_STEP_FRACTION
+
+    def _grading_weight(self, t_f: Any, delta: Any, xp: Any = jnp) -> Any:
         """Return the weight a of ln(tau): without `max_step`, the number of steps in which tau falls to 1/e."""
         return (self.before - (t_f - delta) / self.max_step) / xp.log(t_f / delta)
 
-    def _graded(self, t_f: Scalar, delta: Scalar) -> Float[Array, " nodes"]:
+    def _nodes_before_hand_over(self, t_f: Scalar, delta: Scalar) -> Float[Array, " nodes"]:
         """Return the nodes from 0 to the hand-over [s]."""
-        a = self._grading(t_f, delta)
+        a = self._grading_weight(t_f, delta)
         start, end = a * jnp.log(t_f) + t_f / self.max_step, a * jnp.log(delta) + delta / self.max_step
         level = start + (end - start) * jnp.arange(self.before + 1).astype(float) / self.before
 
@@ -160,18 +169,18 @@ class Graded:
         return (t_f - jnp.exp(u)).at[0].set(0.0).at[-1].set(t_f - delta)
 
 
-def anchored(period: float, t_end: float, t_f_max: float, longest_after: float) -> Anchored:
+def anchored_clock(period: float, t_end: float, t_f_max: float, longest_after: float) -> Anchored:
     """Return the anchored clock for t_f up to `t_f_max` and a hand-over at most `longest_after` before t_end, in s."""
     before, after = math.ceil(t_f_max / period), math.ceil(longest_after / period) + 1
     return Anchored(vector(period), vector(t_end), before, after)
 
 
-def flight(period: float, t_end: float) -> Flight:
+def flight_clock(period: float, t_end: float) -> Flight:
     """Return the flight clock; period and t_end in s."""
     return Flight(vector(period), vector(t_end), math.ceil(t_end / period))
 
 
-def graded(
+def graded_clock(
     t_f: float,
     delta: float,
     t_end: float,
@@ -201,10 +210,10 @@ def graded(
         order: order of a chain, otherwise 1.
     """
     before, after = (math.ceil(steps) for steps in graded_steps(t_f, delta, t_end, hold_rate, frequency, layer, order))
-    times = np.asarray(saves, dtype=float).reshape(-1)
-    step, _ = _largest_steps(t_f, hold_rate, frequency, layer, order)
-    end, width, largest = (vector(v) for v in (t_end, window, step))
-    return Graded(end, width, largest, vector(times), before, after)
+    save_times = np.asarray(saves, dtype=float).reshape(-1)
+    step_before, _ = _largest_steps(t_f, hold_rate, frequency, layer, order)
+    end, window_length, largest_step = (vector(v) for v in (t_end, window, step_before))
+    return Graded(end, window_length, largest_step, vector(save_times), before, after)
 
 
 def graded_steps(
@@ -216,7 +225,7 @@ def graded_steps(
     layer: tuple[float, float],
     order: int,
 ) -> tuple[float, float]:
-    """Return the number of steps of `graded` before and after the hand-over, not rounded up; may be infinite."""
+    """Return the number of steps of `graded_clock` before and after the hand-over, not rounded up; may be infinite."""
     before, after = _largest_steps(t_f, hold_rate, frequency, layer, order)
     with np.errstate(divide="ignore"):
         uniform = float(np.divide(t_f - delta, before))
@@ -232,6 +241,6 @@ def _largest_steps(
     t_f: float, hold_rate: float, frequency: float, layer: tuple[float, float], order: int
 ) -> tuple[float, float]:
     """Return the largest steps before and after the hand-over [s]."""
-    rapid = 0.3 / max(frequency, 1e-12)
-    before = min(t_f / 200.0 / _refinement(order), rapid, 1.5 / max(layer[0], 1e-12))
-    return before, min(t_f / 50.0, 0.1 / max(hold_rate, 1e-300), rapid, 1.5 / max(layer[1], 1e-12))
+    oscillation_step = 0.3 / max(frequency, 1e-12)
+    before = min(t_f / 200.0 / _refinement(order), oscillation_step, 1.5 / max(layer[0], 1e-12))
+    return before, min(t_f / 50.0, 0.1 / max(hold_rate, 1e-300), oscillation_step, 1.5 / max(layer[1], 1e-12))

@@ -55,15 +55,15 @@ class Period(NamedTuple):
     @property
     def assumed_length(self) -> Scalar:
         """The length that the flight software assumes [s]. It does not know that the run ends in its last period."""
-        starts = jnp.where(self.now.partial, self.length, self.full_length)
-        return jnp.where(self.length > 0.0, starts, 0.0)
+        expected = jnp.where(self.now.partial, self.length, self.full_length)
+        return jnp.where(self.length > 0.0, expected, 0.0)
 
 
 # statuses that exported C reports for a sample, the most severe last; other: not known to this version
-SAMPLES = ("ok", "saturated", "missed", "singular", "input", "overflow", "other")
+SAMPLE_STATUSES = ("ok", "saturated", "missed", "singular", "input", "overflow", "other")
 
 
-def no_statuses(computer: Computer) -> dict[str, Array]:
+def count_no_statuses(computer: Computer) -> dict[str, Array]:
     """Return an empty count of sample statuses. Only exported code reports them."""
     return {}
 
@@ -72,10 +72,10 @@ class Software(NamedTuple):
     """The flight software of a run: `boot` and `decide` of this module, or exported C instead of them."""
 
     boot: Callable[[Parts, WholeNumber, WholeNumber, Any, Ticks], Computer]
-    # parts, k2, period, memory, visible and star tracker's state, actuators
+    # arguments: parts, k2, period, memory, visible state, state at star tracker readings, state of the actuators
     decide: Callable[[Parts, Bound, Period, Computer, Any, Any, ActuatorState], tuple[Decision, Computer]]
-    # number of samples of a run that ended with each status, by its name
-    statuses: Callable[[Computer], dict[str, Array]] = no_statuses
+    # returns the number of samples of a run by their status
+    count_statuses: Callable[[Computer], dict[str, Array]] = count_no_statuses
     on_processor: bool = False  # whether it runs on the host processor only
 
 
@@ -92,10 +92,10 @@ def estimate(parts: Parts, period: Period, computer: Computer, seen: Any) -> tup
     """Return the disturbance (m,) [N m], estimated from the change of the state in the last period, and the memory."""
     observer, model, dt = parts.observer, parts.observer.model, period.dt_before
     assert computer.applied is not None
-    torque, stored = computer.applied
-    if stored is not None:  # w x h of the wheels, by the mean rate
-        torque = torque - attitude.cross((model.velocity(computer.seen) + model.velocity(seen)) / 2, stored)
-    impulse = model.unexplained_impulse(period.now.t, computer.seen, seen, torque, dt)
+    torque, wheel_momentum = computer.applied
+    if wheel_momentum is not None:  # w x h of the wheels, by the mean rate
+        torque = torque - attitude.cross((model.velocity(computer.seen) + model.velocity(seen)) / 2, wheel_momentum)
+    impulse = model.implied_disturbance_impulse(period.now.t, computer.seen, seen, torque, dt)
     memory = observer.update(period.matrix, computer.observer, impulse, period.now.t, dt)
     memory = guards.select(dt > 0.0, memory, computer.observer)
     return observer.estimate(memory), memory
@@ -147,4 +147,4 @@ def decide(
     return decision, Computer(sensors, seen, observer, law, computer.applied, command_filter)
 
 
-OURS = Software(boot, decide)
+PYTHON_SOFTWARE = Software(boot, decide)

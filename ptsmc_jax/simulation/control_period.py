@@ -17,7 +17,7 @@ from ptsmc_jax.numerics.draws import WholeNumber
 from ptsmc_jax.numerics.pytrees import Scalar
 from ptsmc_jax.observers.base import Bound
 from ptsmc_jax.simulation.assembly import Parts
-from ptsmc_jax.simulation.computer import OURS, Computer, Decision, Period, Software
+from ptsmc_jax.simulation.computer import PYTHON_SOFTWARE, Computer, Decision, Period, Software
 from ptsmc_jax.simulation.interval import Torques
 
 DISTURBANCE_WALK = "disturbance_walk"
@@ -128,25 +128,25 @@ def control_period(vehicle: Vehicle, state: State, tick: Tick) -> tuple[State, R
 
     # true plant: integrate under the torques and the disturbance
     walk = vehicle.advance_walk(state.walk, dt, now.sample)
-    applied = None if actuators.holds else actuators.assumed(drive, period.length)
+    applied = None if actuators.is_exact_hold else actuators.assumed_torque(drive, period.length)
     motion = PeriodMotion(parts, now.t, state.x, drive, walk)
     after = State(
-        x=motion.at(now.t_next),
+        x=motion.state_at(now.t_next),
         torque=jnp.where(now.t_next > now.t, torques.delivered[-1], state.torque),
         computer=computer._replace(applied=applied),
         actuators=actuators.end(state.actuators, drive, queue, dt),
         walk=walk,
-        star_x=star_state(parts, now, motion.at),
+        star_x=star_state(parts, now, motion.state_at),
         offset=next_offset,
     )
     if next_offset is not None:
         decision = decision._replace(target=parts.reference(now.t))
-    x_at = motion._replace(rolled=True).at  # called once in a run
+    x_at = motion._replace(rolled=True).state_at  # called once in a run
     return after, Record(now, decision, torques, x_at, dt / parts.substeps, drive)
 
 
 def start(
-    parts: Parts, ticks: Ticks, x0: Any, seed: WholeNumber, trial: WholeNumber, software: Software = OURS
+    parts: Parts, ticks: Ticks, x0: Any, seed: WholeNumber, trial: WholeNumber, software: Software = PYTHON_SOFTWARE
 ) -> tuple[Vehicle, State]:
     """Return the constants of a sampled run, and its state before the first control period.
 
@@ -171,7 +171,7 @@ def start(
     state = State(
         x=x0,
         torque=jnp.zeros(inputs),
-        computer=computer._replace(applied=None) if actuators.holds else computer,
+        computer=computer._replace(applied=None) if actuators.is_exact_hold else computer,
         actuators=actuators.begin(inputs),
         walk=None if walk_key is None else jnp.zeros(inputs),
         star_x=star_state(parts, first, lambda t: x0),
@@ -202,22 +202,22 @@ class PeriodMotion(NamedTuple):
     walk: Array | None  # additional disturbance, constant over the period, (m,) [N m]; None: there is none
     rolled: bool = False  # integrate by a loop over the stages, which is slower but compiles faster
 
-    def at(self, time: Scalar) -> Any:
+    def state_at(self, time: Scalar) -> Any:
         """Return the state at a time [s] in the period."""
-        return self.after(time - self.t)
+        return self.state_after(time - self.t)
 
-    def after(self, dt: Scalar) -> Any:
+    def state_after(self, dt: Scalar) -> Any:
         """Return the state dt [s] into the period."""
         parts, drive, walk, actuators = self.parts, self.drive, self.walk, self.parts.actuators
         step = dt / parts.substeps
 
         def substep(k: Scalar, x: Any) -> Any:
-            start, applied = self.t + k * step, actuators.over(drive, k * step, step)
+            start, applied = self.t + k * step, actuators.torque_over(drive, k * step, step)
 
-            def rate(time: Scalar, y: Any) -> Any:
-                d = parts.disturbance(time, y)
-                torque = applied.at(time - start, parts.plant.velocity(y))
-                return parts.plant.rate(time, y, torque, d if walk is None else d + walk)
+            def rate(time: Scalar, x_stage: Any) -> Any:
+                d = parts.disturbance(time, x_stage)
+                torque = applied.torque_at(time - start, parts.plant.velocity(x_stage))
+                return parts.plant.rate(time, x_stage, torque, d if walk is None else d + walk)
 
             return integrators.rk4(rate, start, x, step, rolled=self.rolled or parts.plant.custom_functions)
 
@@ -237,7 +237,7 @@ def star_state(parts: Parts, now: Ticks, x_at: Callable[[Scalar], Any]) -> Any:
         now: the period.
         x_at: function from a time in the period [s] to the true state.
     """
-    ages = parts.sensors.taken_ago(now.sample + 1, now.t_next - now.t)
+    ages = parts.sensors.newest_reading_age(now.sample + 1, now.t_next - now.t)
     return jax.tree.map(lambda age: parts.plant.visible(x_at(now.t_next - age)), ages)
 
 
@@ -245,10 +245,10 @@ def period_torques(actuators: Actuators, drive: Drive, u: Array, dt: Scalar) -> 
     """Return commanded and delivered torques of a control period of dt [s], and the momentum of the wheels in it."""
     wheels = actuators.wheels is not None
     # with a lag the torque may change its sign within the period, where the wheels' momentum may then peak
-    times = (jnp.zeros_like(dt), dt / 2, dt) if actuators.moves or wheels else (jnp.zeros_like(dt),)
-    torques, momenta = zip(*(actuators.at(drive, time) for time in times), strict=True)
-    weights = (1 / 6, 4 / 6, 1 / 6) if actuators.moves else (1.0,)
-    delivered = tuple(actuators.on_body(v) for v in torques[: len(weights)])
-    stored = jnp.stack(momenta[1:]) if wheels else None
-    of_wheels = jnp.stack([torques[0], torques[-1]]) if wheels else None  # monotonic in between: the ends bound it
-    return Torques((u,) * len(weights), delivered, weights, drive.limited, stored, of_wheels)
+    times = (jnp.zeros_like(dt), dt / 2, dt) if actuators.has_dynamics or wheels else (jnp.zeros_like(dt),)
+    channel_torques, wheel_momenta = zip(*(actuators.torque_and_momentum(drive, time) for time in times), strict=True)
+    weights = (1 / 6, 4 / 6, 1 / 6) if actuators.has_dynamics else (1.0,)
+    delivered = tuple(actuators.on_body(v) for v in channel_torques[: len(weights)])
+    wheel_momentum = jnp.stack(wheel_momenta[1:]) if wheels else None
+    wheel_torque = jnp.stack([channel_torques[0], channel_torques[-1]]) if wheels else None  # monotonic in between
+    return Torques((u,) * len(weights), delivered, weights, drive.limited, wheel_momentum, wheel_torque)

@@ -15,19 +15,24 @@ from jaxtyping import Array
 from ptsmc_jax.numerics import paths
 from ptsmc_jax.simulation.assembly import Parts, check_parts
 
-WHOLE, AXIS = "observer_gain", "observer_gain_"
-BANDWIDTH, T_F = "sensors.filter.bandwidth", "controller.t_f"  # both change more than one field of the parts
-LAST = ("k1", "sign_width", "surface_rate", "t_f")  # gains of the law that reports list after the observer's gains
-BUILD_AGAIN = "build the parts for them, with ptsmc_jax.replace or with the argument reach of scenario.study"
+OBSERVER_GAIN, AXIS = "observer_gain", "observer_gain_"
+BANDWIDTH, T_F = "sensors.filter.bandwidth", "controller.t_f"  # each of these gains changes several fields of the parts
+LISTED_LAST = (
+    "k1",
+    "sign_width",
+    "surface_rate",
+    "t_f",
+)  # gains of the law that reports list after the observer's gains
+REBUILD_ADVICE = "build the parts for them, with ptsmc_jax.replace or with the argument reach of scenario.study"
 
 
 def base(name: str) -> str:
     """Return the gain that a name belongs to: `observer_gain` for `observer_gain_2`."""
-    return WHOLE if name.startswith(AXIS) and name.removeprefix(AXIS).isdecimal() else name
+    return OBSERVER_GAIN if name.startswith(AXIS) and name.removeprefix(AXIS).isdecimal() else name
 
 
 def is_reserved(name: str) -> bool:
-    """Whether a name belongs to a gain of the observer, the sensors or a filter, so that no law may use it."""
+    """Return whether a name is reserved for gains of the observer, the sensors or a filter. No law may use it."""
     return name.startswith(("observer_", "sensors_")) or name in ("filter_bandwidth", "command_corner")
 
 
@@ -39,7 +44,7 @@ def paths_of(parts: Parts) -> dict[str, str]:
     """
     law = {name: f"controller.{name}" for name in parts.controller.tunable}
     axes = {f"{AXIS}{k + 1}": f"observer.gain[{k}]" for k in range(len(getattr(parts.observer, "gain", ())))}
-    observer = {WHOLE: "observer.gain"} if axes else {}
+    observer = {OBSERVER_GAIN: "observer.gain"} if axes else {}
     observer |= {f"observer_{name}": f"observer.{name}" for name in parts.observer.tunable}
     custom = getattr(parts.sensors, "custom", None)
     devices = {f"sensors_{name}": f"sensors.custom.{name}" for name in getattr(custom, "tunable", ())}
@@ -49,15 +54,15 @@ def paths_of(parts: Parts) -> dict[str, str]:
         devices["command_corner"] = "command_filter.corner"
     for name in law.keys() & (observer | devices | axes).keys():
         raise ValueError(f"{name} is a gain of the law and of another part; rename the gain of the law")
-    last = {name: law.pop(name) for name in parts.controller.tunable if name in LAST}
+    last = {name: law.pop(name) for name in parts.controller.tunable if name in LISTED_LAST}
     return {**law, **observer, **last, **devices, **axes}
 
 
-def _get(parts: Parts, path: str) -> Any:
+def _gain_at(parts: Parts, path: str) -> Any:
     return parts.sensors.bandwidth(parts.period) if path == BANDWIDTH else paths.get(parts, path)
 
 
-def _put(parts: Parts, path: str, value: Any) -> Parts:
+def _with_gain_at(parts: Parts, path: str, value: Any) -> Parts:
     if path == BANDWIDTH:
         return replace(parts, sensors=parts.sensors.with_bandwidth(value, parts.period))
     if path == T_F:
@@ -82,19 +87,19 @@ def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
         TypeError: the first argument is not the parts of a run.
     """
     check_parts(parts)
-    known = {"t_f": T_F, **paths_of(parts)}
+    gain_paths = {"t_f": T_F, **paths_of(parts)}
     for name in gains:
-        if name not in known:
-            raise ValueError(f"{name} is no gain of these parts; allowed are {', '.join(sorted(known))}")
-    numbers = {name: _number(name, value) for name, value in gains.items()}
-    for name, path in known.items():  # single axes come last, so that they override the gain of all axes
+        if name not in gain_paths:
+            raise ValueError(f"{name} is no gain of these parts; allowed are {', '.join(sorted(gain_paths))}")
+    numbers = {name: _convert_gain(name, value) for name, value in gains.items()}
+    for name, path in gain_paths.items():  # single axes come last, so that they override the gain of all axes
         if name in numbers:
-            parts = _put(parts, path, numbers[name])
+            parts = _with_gain_at(parts, path, numbers[name])
     _check_clock(parts)
     return parts
 
 
-def _number(name: str, value: Any) -> Array:
+def _convert_gain(name: str, value: Any) -> Array:
     """Return a gain as an array. Raises ValueError if it is not a finite scalar. JAX would accept strings, too."""
     try:
         if isinstance(value, str | bytes | bool) or value is None:
@@ -105,8 +110,8 @@ def _number(name: str, value: Any) -> Array:
     if not (isinstance(number, core.Tracer) or np.isfinite(number).all()):
         raise ValueError(f"{name} is {value!r}, but must be a finite number")
     if number.ndim:
-        instead = f"{AXIS}1, {AXIS}2, .. set single axes" if name == WHOLE else "jax.vmap takes one at a time"
-        raise ValueError(f"{name} must be a number, but has shape {number.shape}; {instead}")
+        advice = f"{AXIS}1, {AXIS}2, .. set single axes" if name == OBSERVER_GAIN else "jax.vmap takes one at a time"
+        raise ValueError(f"{name} must be a number, but has shape {number.shape}; {advice}")
     return number
 
 
@@ -114,33 +119,33 @@ def _check_clock(parts: Parts) -> None:
     """Raise ValueError if a clock has too few samples or steps for t_f and delta. Traced values are not checked."""
     clock: Any = parts.clock
     law = parts.controller
-    longest = clock.period if clock.sampled else clock.max_step  # longest step [s]
-    times = [law.t_f, law.delta, parts.t_end, longest]
+    longest_step = clock.period if clock.sampled else clock.max_step  # [s]
+    times = [law.t_f, law.delta, parts.t_end, longest_step]
     if any(isinstance(v, core.Tracer) or np.ndim(v) > 0 for v in times):
         return
-    t_f, delta, t_end, longest = map(float, times)
+    t_f, delta, t_end, longest_step = map(float, times)
     # plain numbers, because JAX arrays would become tracers if another gain is traced
-    if not clock.sampled and replace(clock, max_step=longest).too_coarse(t_f, delta, np):
+    if not clock.sampled and replace(clock, max_step=longest_step).is_too_coarse(t_f, delta, np):
         raise ValueError(
             f"t_f = {t_f:g} s with delta = {delta:g} s needs more than the {clock.before} steps that the parts' "
-            f"continuous loop has before the hand-over; {BUILD_AGAIN}"
+            f"continuous loop has before the hand-over; {REBUILD_ADVICE}"
         )
     if not clock.anchored:
         return
     hand_over = t_f - delta
-    for where, needed, samples in (("before", hand_over, clock.before), ("after", t_end - hand_over, clock.after)):
-        if needed > samples * longest * (1.0 + 1e-9):
+    for side, needed, samples in (("before", hand_over, clock.before), ("after", t_end - hand_over, clock.after)):
+        if needed > samples * longest_step * (1.0 + 1e-9):
             raise ValueError(
-                f"t_f = {t_f:g} s with delta = {delta:g} s needs {needed:g} s of samples {where} the hand-over, but "
-                f"the parts' clock has {samples * longest:g}; {BUILD_AGAIN}"
+                f"t_f = {t_f:g} s with delta = {delta:g} s needs {needed:g} s of samples {side} the hand-over, but "
+                f"the parts' clock has {samples * longest_step:g}; {REBUILD_ADVICE}"
             )
 
 
 def present_values(parts: Parts, names: Iterable[str]) -> list[float]:
     """Return the present values of these gains. For `observer_gain` it is the mean of the axes."""
-    known, values = paths_of(parts), list[float]()
+    gain_paths, values = paths_of(parts), list[float]()
     for name in names:
-        value = np.ravel(_get(parts, known[name])).tolist()
+        value = np.ravel(_gain_at(parts, gain_paths[name])).tolist()
         values.append(sum(value) / len(value))
     return values
 
@@ -151,17 +156,17 @@ def gains_of(parts: Parts) -> dict[str, float]:
     names = [*paths_of(parts)]
     gains = dict(zip(names, present_values(parts, names), strict=True))
     axes = [name for name in names if base(name) != name]
-    alike = len({gains[name] for name in axes}) <= 1
-    return {name: value for name, value in gains.items() if not (alike and name in axes)}
+    axes_are_equal = len({gains[name] for name in axes}) <= 1
+    return {name: value for name, value in gains.items() if not (axes_are_equal and name in axes)}
 
 
-def on_every_axis(gains: Mapping[str, Any], present: list[Any]) -> list[Any] | None:
+def gain_of_each_axis(gains: Mapping[str, Any], present: list[Any]) -> list[Any] | None:
     """Return the observer gain of every axis, or None if `gains` has no observer gain.
 
     Args:
         gains: new values by name.
         present: present value of each axis, used for an axis without a new value.
     """
-    if not any(base(name) == WHOLE for name in gains):
+    if not any(base(name) == OBSERVER_GAIN for name in gains):
         return None
-    return [gains.get(f"{AXIS}{k + 1}", gains.get(WHOLE, value)) for k, value in enumerate(present)]
+    return [gains.get(f"{AXIS}{k + 1}", gains.get(OBSERVER_GAIN, value)) for k, value in enumerate(present)]

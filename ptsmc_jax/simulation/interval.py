@@ -39,7 +39,7 @@ class Start(NamedTuple):
 
 
 class Arrival(NamedTuple):
-    """The true state at t_f; zero before."""
+    """Error and angle of the true state at t_f; zero until t_f is reached."""
 
     error: Array  # (m,) error that the law drives to zero [-]; for other plants x_1
     angle: Array  # angle to the reference [rad]
@@ -112,7 +112,8 @@ def integral_in_window(t: Any, t_next: Any, squares: tuple[Any, Any, Any], crite
         return x * (g0 + x * ((-3 * g0 + 4 * g1 - g2) / 2 + x * (2 * g0 - 4 * g1 + 2 * g2) / 3))
 
     begin, end = fraction(criteria.t_f), fraction(criteria.t_f + criteria.window)
-    least = (end - begin) ** 3 / 4 * (g0 + 4 * g1 + g2) / 6
-    part = primitive(end) - primitive(begin)
-    xp: Any = np if isinstance(part, np.ndarray) else jnp
-    return dt * xp.where(part < least, least, part)  # `maximum` has another gradient if both are zero, at the ends
+    smallest_integral = (end - begin) ** 3 / 4 * (g0 + 4 * g1 + g2) / 6
+    window_integral = primitive(end) - primitive(begin)
+    xp: Any = np if isinstance(window_integral, np.ndarray) else jnp
+    # `maximum` would have another gradient at the ends of the window, where both integrals are zero
+    return dt * xp.where(window_integral < smallest_integral, smallest_integral, window_integral)

@@ -59,14 +59,14 @@ class Metric:
     may_be_nan: bool = False  # whether the metric may be NaN in a run that did not diverge
 
 
-def _peak(during: Callable[[Interval], Any], init: Callable[[Start, Criteria], Any] = _zero) -> dict[str, Any]:
+def _peak(largest_in: Callable[[Interval], Any], init: Callable[[Start, Criteria], Any] = _zero) -> dict[str, Any]:
     """Return `init` and `update` of the metric that is the largest value over all intervals.
 
     Args:
-        during: function from an interval to its largest value.
+        largest_in: function from an interval to its largest value.
         init: value at t = 0, by default 0.
     """
-    return {"init": init, "update": lambda memory, interval, criteria: jnp.maximum(memory, during(interval))}
+    return {"init": init, "update": lambda memory, interval, criteria: jnp.maximum(memory, largest_in(interval))}
 
 
 def _hold_peak(at_end: Callable[[Interval, Errors], Array], at_t_f: Callable[[Arrival], Array]) -> dict[str, Any]:
@@ -89,8 +89,8 @@ def _window_rms(squares: Callable[[Interval, Errors], tuple[Array, Array, Array]
     """
 
     def update(memory: Array, interval: Interval, errors: Errors, criteria: Criteria) -> Array:
-        some = squares(interval, errors)
-        return memory + intervals.integral_in_window(interval.t, interval.t_next, some, criteria)
+        values = squares(interval, errors)
+        return memory + intervals.integral_in_window(interval.t, interval.t_next, values, criteria)
 
     def value(memory: Array, running: Running, criteria: Criteria) -> Array:
         return guards.sqrt(memory / criteria.window)
@@ -111,61 +111,61 @@ def _squared_angles(interval: Interval, errors: Errors) -> tuple[Array, Array, A
     return start * start, middle * middle, end * end
 
 
-def _largest(torques: tuple[Array, ...]) -> Array:
+def _largest_component(torques: tuple[Array, ...]) -> Array:
     return jnp.max(jnp.stack([jnp.max(jnp.abs(u)) for u in torques]))
 
 
-def _size(of_wheels: Any) -> Array:
-    return jnp.max(jnp.abs(of_wheels))
+def _largest_value(wheel_values: Any) -> Array:
+    return jnp.max(jnp.abs(wheel_values))
 
 
 def _limited_fraction(memory: Array, running: Running, criteria: Criteria) -> Array:
-    """Return the fraction of the time with a limited command, or NaN if a delivered torque was NaN."""
+    """Return the fraction of the time in which a limit cuts the command, or NaN if a delivered torque was NaN."""
     return jnp.where(jnp.isnan(running.memories["effort"]), jnp.nan, memory / criteria.t_end)
 
 
-def _effort(memory: Array, interval: Interval, criteria: Criteria) -> Array:
+def _add_effort(memory: Array, interval: Interval, criteria: Criteria) -> Array:
     torques = interval.torques
     norms = (w * jnp.sum(jnp.abs(u)) for w, u in zip(torques.weights, torques.delivered, strict=True))
     return memory + interval.length * sum(norms)
 
 
-def _unsettled(snapshot: Snapshot, criteria: Criteria) -> Array:
+def _is_unsettled(snapshot: Snapshot, criteria: Criteria) -> Array:
     return ~(snapshot.angle < criteria.settling_angle)  # also if the angle is NaN
 
 
-def _settled_at(memory: Array, interval: Interval, criteria: Criteria) -> Array:
+def _update_settling_time(memory: Array, interval: Interval, criteria: Criteria) -> Array:
     """Return the last time at which the angle falls below the settling angle [s]; infinite while it is above."""
     start, end = interval.start, interval.end
-    above, above_next = _unsettled(start, criteria), _unsettled(end, criteria)
-    drop = jnp.where(above & ~above_next, start.angle - end.angle, 1.0)
-    crossing = interval.t + interval.length * (start.angle - criteria.settling_angle) / drop
-    return jnp.where(above_next, jnp.inf, jnp.where(above, crossing, memory))
+    is_above, is_above_next = _is_unsettled(start, criteria), _is_unsettled(end, criteria)
+    decrease = jnp.where(is_above & ~is_above_next, start.angle - end.angle, 1.0)
+    crossing = interval.t + interval.length * (start.angle - criteria.settling_angle) / decrease
+    return jnp.where(is_above_next, jnp.inf, jnp.where(is_above, crossing, memory))
 
 
-def _variation(memory: Array, interval: Interval, errors: Errors, criteria: Criteria) -> Array:
+def _add_torque_variation(memory: Array, interval: Interval, errors: Errors, criteria: Criteria) -> Array:
     """Return the total variation of the torque delivered from t_f on, (m,) [N m]."""
     delivered = interval.torques.delivered
     tolerance = guards.time_tolerance(interval.length, criteria.t_f)  # the jump of a sample at t_f must not count
     jump = jnp.where(interval.t > criteria.t_f + tolerance, jnp.abs(delivered[0] - interval.last_torque), 0.0)
-    inside = sum((jnp.abs(v - u) for u, v in pairwise(delivered)), start=jnp.zeros_like(jump))
-    return memory + jump + jnp.where(interval.t >= criteria.t_f - tolerance, inside, 0.0)
+    change_inside = sum((jnp.abs(v - u) for u, v in pairwise(delivered)), start=jnp.zeros_like(jump))
+    return memory + jump + jnp.where(interval.t >= criteria.t_f - tolerance, change_inside, 0.0)
 
 
-def _chattering(memory: Array, running: Running, criteria: Criteria) -> Array:
+def _variation_per_second(memory: Array, running: Running, criteria: Criteria) -> Array:
     length = criteria.t_end - criteria.t_f
     return jnp.max(memory) / jnp.where(length > 0.0, length, 1.0)
 
 
-def _residual(memory: Array, interval: Interval, criteria: Criteria) -> Array:
+def _update_residual_amplitude(memory: Array, interval: Interval, criteria: Criteria) -> Array:
     """Return the largest amplitude of the flexible modes at the ends of intervals from t_f on.
 
     Before t_f the memory is the initial amplitude. It does not count and is replaced at t_f.
     """
     amplitude = interval.end.modal_amplitude
     assert amplitude is not None
-    early, reached = interval.t < criteria.t_f, interval.t_next >= criteria.t_f
-    return jnp.where(reached, jnp.where(early, amplitude, jnp.maximum(memory, amplitude)), memory)
+    starts_before_t_f, reaches_t_f = interval.t < criteria.t_f, interval.t_next >= criteria.t_f
+    return jnp.where(reaches_t_f, jnp.where(starts_before_t_f, amplitude, jnp.maximum(memory, amplitude)), memory)
 
 
 METRICS = {
@@ -189,10 +189,10 @@ METRICS = {
     "peak_torque": Metric(
         "N m", "largest commanded torque about one axis, before the actuator",
         ("u", "largest commanded component of the input, before the actuator"),
-        **_peak(lambda interval: _largest(interval.torques.commanded))),
+        **_peak(lambda interval: _largest_component(interval.torques.commanded))),
     "peak_torque_delivered": Metric(
         "N m", "largest delivered torque about one axis", ("u", "largest delivered component of the input"),
-        **_peak(lambda interval: _largest(interval.torques.delivered))),
+        **_peak(lambda interval: _largest_component(interval.torques.delivered))),
     "saturated": Metric(
         "-", "fraction of the time in which a limit of the actuators cuts the command",
         ("-", "fraction of the time in which a limit of the actuators cuts the command"),
@@ -200,17 +200,18 @@ METRICS = {
         value=_limited_fraction),
     "effort": Metric(
         "N m s", "integral of the 1-norm of the delivered torque",
-        ("u s", "integral of the 1-norm of the delivered input"), update=_effort),
+        ("u s", "integral of the 1-norm of the delivered input"), update=_add_effort),
     "settling_time": Metric(
         "s", "time from which the angle stays below settling_angle, interpolated between ends of periods",
         ("s", "time from which |x_1| stays below settling_angle, interpolated between ends of periods"),
-        init=lambda start, criteria: jnp.where(_unsettled(start.snapshot, criteria), jnp.inf, 0.0),
-        update=_settled_at,
+        init=lambda start, criteria: jnp.where(_is_unsettled(start.snapshot, criteria), jnp.inf, 0.0),
+        update=_update_settling_time,
         value=lambda memory, running, criteria: jnp.where(jnp.isfinite(memory), memory, jnp.nan), may_be_nan=True),
     "chattering": Metric(
         "N m/s", "total variation of the delivered torque per second after t_f, largest axis",
         ("u/s", "total variation of the delivered input per second after t_f, largest component"),
-        init=lambda start, criteria: jnp.zeros(start.inputs), update_after_t_f=_variation, value=_chattering),
+        init=lambda start, criteria: jnp.zeros(start.inputs), update_after_t_f=_add_torque_variation,
+        value=_variation_per_second),
     "peak_rate": Metric(
         "rad/s", "largest 2-norm of the body rate", ("x2", "largest |x_2|"),
         **_peak(lambda interval: interval.end.rate, lambda start, criteria: start.snapshot.rate)),
@@ -219,16 +220,17 @@ METRICS = {
         **_peak(lambda interval: interval.end.momentum, lambda start, criteria: start.snapshot.momentum)),
     "peak_wheel_momentum": Metric(
         "N m s", "largest momentum stored in one reaction wheel", table="wheels",
-        **_peak(lambda interval: _size(interval.torques.wheel_momentum),
-                lambda start, criteria: None if start.wheel_momentum is None else _size(start.wheel_momentum))),
+        **_peak(lambda interval: _largest_value(interval.torques.wheel_momentum),
+                lambda start, criteria: (
+                    None if start.wheel_momentum is None else _largest_value(start.wheel_momentum)))),
     "peak_wheel_torque": Metric(
         "N m", "largest torque of one reaction wheel", table="wheels",
-        **_peak(lambda interval: _size(interval.torques.wheel_torque),
+        **_peak(lambda interval: _largest_value(interval.torques.wheel_torque),
                 lambda start, criteria: None if start.wheel_momentum is None else _zero(start, criteria))),
     "peak_modal": Metric(
         "sqrt(kg) m", "largest size of the flexible modes' motion, (sum of e^2 + (e'/W)^2)^1/2", table="flexible",
         **_peak(lambda interval: interval.end.modal_amplitude, lambda start, criteria: start.snapshot.modal_amplitude)),
     "residual_modal": Metric(
-        "sqrt(kg) m", "the same from t_f to t_end", table="flexible",
-        init=lambda start, criteria: start.snapshot.modal_amplitude, update=_residual),
+        "sqrt(kg) m", "largest size of the flexible modes' motion from t_f to t_end", table="flexible",
+        init=lambda start, criteria: start.snapshot.modal_amplitude, update=_update_residual_amplitude),
 }  # fmt: skip

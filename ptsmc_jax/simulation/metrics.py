@@ -43,14 +43,14 @@ class Metrics(dict[str, Any]):
 
     def __repr__(self) -> str:
         """Return a line for each metric: its value, or type and shape for many runs or under a transformation."""
-        return "\n".join(f"{name:24s} {_shown(value)}" for name, value in self.items())
+        return "\n".join(f"{name:24s} {_format_value(value)}" for name, value in self.items())
 
 
-def _shown(value: Any) -> str:
+def _format_value(value: Any) -> str:
     if not isinstance(value, jax.Array | np.ndarray | np.number | float):
         return repr(value)  # under transformations a leaf may be a shape or an axis
-    several = isinstance(value, core.Tracer) or np.ndim(value) > 0
-    return f"{type(value).__name__} {np.shape(value)}" if several else f"{float(value):.6g}"
+    is_array = isinstance(value, core.Tracer) or np.ndim(value) > 0
+    return f"{type(value).__name__} {np.shape(value)}" if is_array else f"{float(value):.6g}"
 
 
 class Running(NamedTuple):
@@ -72,15 +72,21 @@ def begin(start: Start, criteria: Criteria) -> Running:
 def update(running: Running, interval: Interval, criteria: Criteria) -> Running:
     """Return the accumulators after one more interval. An interval of length zero changes nothing."""
     has_length, old = interval.length > 0.0, running.memories
-    new = {name: m.update(old[name], interval, criteria) for name, m in METRICS.items() if name in old and m.update}
-    late = {name: old[name] for name, metric in METRICS.items() if name in old and metric.update_after_t_f}
-    arrival, late, pointing = jax.lax.cond(
+    updated = {
+        name: metric.update(old[name], interval, criteria)
+        for name, metric in METRICS.items()
+        if name in old and metric.update
+    }
+    memories_after_t_f = {
+        name: old[name] for name, metric in METRICS.items() if name in old and metric.update_after_t_f
+    }
+    arrival, memories_after_t_f, pointing = jax.lax.cond(
         has_length & (interval.t_next >= criteria.t_f),
-        lambda: _update_after_t_f(Running(running.arrival, late, running.pointing), interval, criteria),
-        lambda: Running(running.arrival, late, running.pointing),
+        lambda: _update_after_t_f(Running(running.arrival, memories_after_t_f, running.pointing), interval, criteria),
+        lambda: Running(running.arrival, memories_after_t_f, running.pointing),
     )
-    new = guards.select(has_length, new, {name: old[name] for name in new})
-    return Running(arrival, {**old, **new, **late}, pointing)
+    updated = guards.select(has_length, updated, {name: old[name] for name in updated})
+    return Running(arrival, {**old, **updated, **memories_after_t_f}, pointing)
 
 
 def _update_after_t_f(running: Running, interval: Interval, criteria: Criteria) -> Running:
@@ -97,11 +103,13 @@ def _update_after_t_f(running: Running, interval: Interval, criteria: Criteria) 
 def finish(running: Running, criteria: Criteria) -> Metrics:
     """Return the metrics of the complete run from the accumulators at t_end."""
     memories = running.memories
-    values = {name: m.value(memories[name], running, criteria) for name, m in METRICS.items() if name in memories}
-    return Metrics(values | pointing_report.values(running.pointing, criteria))
+    values = {
+        name: metric.value(memories[name], running, criteria) for name, metric in METRICS.items() if name in memories
+    }
+    return Metrics(values | pointing_report.metric_values(running.pointing, criteria))
 
 
-def unbounded(values: Metrics) -> Array:
+def is_unbounded(values: Metrics) -> Array:
     """Return whether a metric is infinite or NaN, for example because a square overflows."""
-    checked = [values[name] for name in METRICS if name in values and not METRICS[name].may_be_nan]
-    return ~jnp.all(jnp.isfinite(jnp.stack(checked)))
+    finite_metrics = [values[name] for name in METRICS if name in values and not METRICS[name].may_be_nan]
+    return ~jnp.all(jnp.isfinite(jnp.stack(finite_metrics)))

@@ -28,7 +28,7 @@ Vector = Float[Array, "3"]
 # Directions across the boresight, over half a turn, onto which an error is projected. The largest projection is at most
 # 1/cos(pi/32) - 1 = 0.5 % smaller than the half-cone, and is enlarged by this factor.
 DIRECTIONS = 16
-ALONG = np.pi * np.arange(DIRECTIONS) / DIRECTIONS
+DIRECTION_ANGLES = np.pi * np.arange(DIRECTIONS) / DIRECTIONS
 
 
 @pytree
@@ -43,11 +43,11 @@ class Pointing:
     limits: dict[str, Leaf] = field(default_factory=dict)
     samples: int = field(default=0, metadata={"static": True})  # largest number in a window; 0: all samples of the run
 
-    def of_run(self, steps: int) -> "Pointing":
+    def for_run(self, steps: int) -> "Pointing":
         """Return the observation for a run with this number of steps."""
         return self if self.samples else replace(self, samples=steps)
 
-    def segments(self, index: str) -> int:
+    def segment_count(self, index: str) -> int:
         """Return the number of segments of a window that are stored for a relative index, or 0 without such limits.
 
         n samples divide a window into n + 1 segments. A further segment, without length, is needed if the previous
@@ -56,7 +56,7 @@ class Pointing:
         return self.samples + 2 if any(name.startswith(index) for name in self.limits) else 0
 
 
-def across(boresight: Any) -> np.ndarray:
+def boresight_frame(boresight: Any) -> np.ndarray:
     """Return the frame (3, 3) of a boresight (3,) of any length: rows are its unit vector and two directions across."""
     b = np.asarray(boresight, dtype=float)
     b = b / np.linalg.norm(b)
@@ -78,18 +78,20 @@ def attitude_error(q: Float[Array, "4"], target: Float[Array, "4"], frame: Float
     """
     error = attitude.multiply(attitude.conjugate(target), q)
     error = jnp.where(error[3] < 0.0, -error, error)
-    return jnp.concatenate([attitude.rotation_vector(error[:3]), _cone(attitude.rotate(error, frame[0]), frame)])
+    return jnp.concatenate(
+        [attitude.rotation_vector(error[:3]), _boresight_error(attitude.rotate(error, frame[0]), frame)]
+    )
 
 
-def _cone(pointed: Vector, frame: Float[Array, "3 3"]) -> Float[Array, "2"]:
+def _boresight_error(direction: Vector, frame: Float[Array, "3 3"]) -> Float[Array, "2"]:
     """Return the angle from the boresight to a unit vector times the direction of the error across it [rad]."""
-    side, ahead = frame[1:] @ pointed, jnp.dot(frame[0], pointed)
-    square = jnp.sum(side * side)
+    across, along = frame[1:] @ direction, jnp.dot(frame[0], direction)
+    square = jnp.sum(across * across)
     small = square < 1e-12  # then the angle is equal to its sine to 1e-12 relative
     size = jnp.sqrt(jnp.where(small, 1.0, square))
-    turned = elementary.arctan2(size, jnp.abs(ahead))
-    arc = side * jnp.where(small, 1.0 + square / 6.0, jnp.where(ahead < 0.0, np.pi - turned, turned) / size)
-    return jnp.where(small & (ahead < 0.0), np.pi * jnp.eye(2)[0], arc)  # exactly backwards: any direction
+    angle = elementary.arctan2(size, jnp.abs(along))
+    arc = across * jnp.where(small, 1.0 + square / 6.0, jnp.where(along < 0.0, np.pi - angle, angle) / size)
+    return jnp.where(small & (along < 0.0), np.pi * jnp.eye(2)[0], arc)  # exactly backwards: any direction
 
 
 class ErrorPath(NamedTuple):
@@ -102,7 +104,7 @@ class ErrorPath(NamedTuple):
     b: Array
     length: Scalar  # length of the interval [s]
 
-    def at(self, x: Scalar) -> Array:
+    def error_at(self, x: Scalar) -> Array:
         """Return the error at the fraction x of the interval."""
         return self.start + x * self.rise + x * (1.0 - x) * ((1.0 - x) * self.a + x * self.b)
 
@@ -120,7 +122,7 @@ class ConstantPath(NamedTuple):
     end: Array  # [rad]
     length: Scalar  # length of the interval [s]
 
-    def at(self, x: Scalar) -> Array:
+    def error_at(self, x: Scalar) -> Array:
         """Return the error."""
         return self.end
 
@@ -129,7 +131,7 @@ class ConstantPath(NamedTuple):
         return self.length * (x * self.end)
 
 
-def hermite(start: Array, start_rate: Array, end: Array, end_rate: Array, length: Scalar) -> ErrorPath:
+def hermite_path(start: Array, start_rate: Array, end: Array, end_rate: Array, length: Scalar) -> ErrorPath:
     """Return the cubic Hermite path between two errors (5,) [rad] with these rates [rad/s], over a length [s]."""
     rise = end - start
     return ErrorPath(start, end, rise, length * start_rate - rise, rise - length * end_rate, length)
@@ -142,7 +144,7 @@ def error_path(start: tuple, end: tuple, frame: Float[Array, "3 3"], length: Sca
         rates = attitude.derivative(x.q, x.w), attitude.derivative(target.q, target.w)
         return jax.jvp(lambda q, target: attitude_error(q, target, frame), (x.q, target.q), rates)
 
-    return hermite(*with_rate(*start), *with_rate(*end), length)
+    return hermite_path(*with_rate(*start), *with_rate(*end), length)
 
 
 def constant_path(
@@ -159,7 +161,7 @@ class Segments(NamedTuple):
     lengths: Array  # (segments,) length of each segment [s]; 0: not filled yet
     filled: Array  # number of filled segments
 
-    def added(self, start: Array, end: Array, length: Scalar) -> "Segments":
+    def with_segment(self, start: Array, end: Array, length: Scalar) -> "Segments":
         """Append a segment. If no space is left, it is dropped and `filled` exceeds the number of places."""
         return Segments(
             self.ends.at[self.filled].set(jnp.stack([start, end])),
@@ -167,17 +169,17 @@ class Segments(NamedTuple):
             self.filled + 1,
         )
 
-    def emptied(self) -> "Segments":
+    def without_segments(self) -> "Segments":
         """Return the buffer without segments."""
         return Segments(self.ends, jnp.zeros_like(self.lengths), jnp.zeros_like(self.filled))
 
     def time_beyond(self, mean: Array, limits: Float[Array, "4"]) -> Float[Array, "4"]:
         """Return the time in which the error minus its mean is beyond limits [s]; NaN if a segment was dropped."""
 
-        def of_segment(ends: Array, length: Scalar) -> Array:
+        def time_in_segment(ends: Array, length: Scalar) -> Array:
             return length * _fraction_beyond(_sizes(ends[0] - mean), _sizes(ends[1] - mean), limits)
 
-        total = jnp.sum(jax.vmap(of_segment)(self.ends, self.lengths), axis=0)
+        total = jnp.sum(jax.vmap(time_in_segment)(self.ends, self.lengths), axis=0)
         return jnp.where(self.filled > self.lengths.size, jnp.nan, total)
 
 
@@ -189,7 +191,7 @@ class Window(NamedTuple):
     low: Array  # (3 + DIRECTIONS,) smallest projections of the error [rad]
     segments: Segments | None  # None: no limit on the relative error needs them
 
-    def including(self, error: Array) -> "Window":
+    def with_error(self, error: Array) -> "Window":
         """Return the window with `high` and `low` updated by one more value of the error, (5,) [rad]."""
         projections = _projections(error)
         return self._replace(high=jnp.maximum(self.high, projections), low=jnp.minimum(self.low, projections))
@@ -216,12 +218,14 @@ def begin(zero: Scalar, segments: int = 0) -> Tally:
 
     Args:
         zero: a zero with the type of the numbers of the run.
-        segments: see `Pointing.segments`.
+        segments: see `Pointing.segment_count`.
     """
-    four, many = jnp.zeros(4) + zero, jnp.zeros(3 + DIRECTIONS) + zero
-    kept = Segments(jnp.zeros((segments, 2, 5)) + zero, jnp.zeros(segments) + zero, jnp.int32(0)) if segments else None
-    window = Window(jnp.zeros(5) + zero, many - jnp.inf, many + jnp.inf, kept)
-    return Tally(four, four, four, window, many - jnp.inf, many + jnp.inf, zero, four, four, four)
+    zeros, projections = jnp.zeros(4) + zero, jnp.zeros(3 + DIRECTIONS) + zero
+    buffer = (
+        Segments(jnp.zeros((segments, 2, 5)) + zero, jnp.zeros(segments) + zero, jnp.int32(0)) if segments else None
+    )
+    window = Window(jnp.zeros(5) + zero, projections - jnp.inf, projections + jnp.inf, buffer)
+    return Tally(zeros, zeros, zeros, window, projections - jnp.inf, projections + jnp.inf, zero, zeros, zeros, zeros)
 
 
 def update(
@@ -229,7 +233,7 @@ def update(
     error: ErrorPath | ConstantPath,
     t: Scalar,
     t_next: Scalar,
-    begins: Scalar,
+    observation_start: Scalar,
     window: Scalar,
     limits: Float[Array, "3 4"],
 ) -> Tally:
@@ -240,72 +244,73 @@ def update(
         error: error over the interval.
         t: start of the interval [s].
         t_next: end of the interval [s].
-        begins: start of the observation [s].
+        observation_start: start of the observation [s].
         window: length D of a window [s].
         limits: limits (3, 4) of the error, its mean and the relative error, about each axis and of the half-cone [rad].
     """
     length = error.length
-    since = jnp.clip((begins - t) / length, 0.0, 1.0)  # fraction of the interval before the observation
-    window_end = begins + (tally.windows + 1.0) * window
-    until = jnp.clip((window_end - t) / length, since, 1.0)  # where the window ends in the interval
-    by_rounding = guards.time_tolerance(window, t_next)
-    observed = t_next > begins + by_rounding
-    closes = observed & (window_end <= t_next + by_rounding)
-    first, last = error.at(since), error.at(until)
+    # fractions of the interval at which the observation starts and the window ends
+    start_fraction = jnp.clip((observation_start - t) / length, 0.0, 1.0)
+    window_end = observation_start + (tally.windows + 1.0) * window
+    end_fraction = jnp.clip((window_end - t) / length, start_fraction, 1.0)
+    tolerance = guards.time_tolerance(window, t_next)
+    is_observed = t_next > observation_start + tolerance
+    is_window_complete = is_observed & (window_end <= t_next + tolerance)
+    first_error, last_error = error.error_at(start_fraction), error.error_at(end_fraction)
     # the start of the observation counts; later intervals begin at the end of the one before
-    opens = t <= begins + guards.time_tolerance(window, t)
-    opened = guards.select(opens, tally.window.including(first), tally.window)
-    largest = jnp.where(opens, jnp.maximum(tally.largest, _sizes(first)), tally.largest)
-    integral = opened.integral + error.integral(until) - error.integral(since)
-    segments = opened.segments
+    is_first = t <= observation_start + guards.time_tolerance(window, t)
+    window_before = guards.select(is_first, tally.window.with_error(first_error), tally.window)
+    largest = jnp.where(is_first, jnp.maximum(tally.largest, _sizes(first_error)), tally.largest)
+    integral = window_before.integral + error.integral(end_fraction) - error.integral(start_fraction)
+    segments = window_before.segments
     if segments is not None:
-        segments = segments.added(first, last, length * (until - since))
-    present = opened._replace(integral=integral, segments=segments).including(last)
-    first_sizes, end_sizes = _sizes(first), _sizes(error.end)
-    still_open = tally._replace(
+        segments = segments.with_segment(first_error, last_error, length * (end_fraction - start_fraction))
+    present_window = window_before._replace(integral=integral, segments=segments).with_error(last_error)
+    first_sizes, end_sizes = _sizes(first_error), _sizes(error.end)
+    without_closing = tally._replace(
         largest=jnp.maximum(largest, end_sizes),
-        window=present,
-        beyond=tally.beyond + length * (1.0 - since) * _fraction_beyond(first_sizes, end_sizes, limits[0]),
+        window=present_window,
+        beyond=tally.beyond + length * (1.0 - start_fraction) * _fraction_beyond(first_sizes, end_sizes, limits[0]),
     )
 
-    def closed() -> Tally:
-        mean = present.integral / window
+    def close_window() -> Tally:
+        mean = present_window.integral / window
         means = _projections(mean)
-        deviations = jnp.maximum(present.high - means, means - present.low)
-        rest = error.integral(jnp.ones_like(until)) - error.integral(until)
-        segments, beyond = present.segments, jnp.zeros(4)
+        deviations = jnp.maximum(present_window.high - means, means - present_window.low)
+        next_integral = error.integral(jnp.ones_like(end_fraction)) - error.integral(end_fraction)
+        segments, beyond = present_window.segments, jnp.zeros(4)
         if segments is not None:
             beyond = segments.time_beyond(mean, limits[2])
-            segments = segments.emptied().added(last, error.end, length * (1.0 - until))
-        projections = _projections(last)
-        new = Window(rest, projections, projections, segments).including(error.end)
+            segments = segments.without_segments().with_segment(last_error, error.end, length * (1.0 - end_fraction))
+        projections = _projections(last_error)
+        next_window = Window(next_integral, projections, projections, segments).with_error(error.end)
         if isinstance(error, ConstantPath):  # the error jumps here: its old value is not part of the next window
-            lasts = t_next > window_end + by_rounding
-            high, low = jnp.where(lasts, new.high, -jnp.inf), jnp.where(lasts, new.low, jnp.inf)
-            new = new._replace(high=high, low=low)
-        return still_open._replace(
-            mean=jnp.maximum(still_open.mean, _sizes(mean)),
-            relative=jnp.maximum(still_open.relative, _sizes_of(deviations)),
-            window=new,
-            means_high=jnp.maximum(still_open.means_high, means),
-            means_low=jnp.minimum(still_open.means_low, means),
-            windows=still_open.windows + 1.0,
-            means_beyond=still_open.means_beyond + jnp.where(_sizes(mean) <= limits[1], 0.0, window),
-            relative_beyond=still_open.relative_beyond + beyond,
+            continues = t_next > window_end + tolerance
+            high, low = jnp.where(continues, next_window.high, -jnp.inf), jnp.where(continues, next_window.low, jnp.inf)
+            next_window = next_window._replace(high=high, low=low)
+        return without_closing._replace(
+            mean=jnp.maximum(without_closing.mean, _sizes(mean)),
+            relative=jnp.maximum(without_closing.relative, _sizes_from_projections(deviations)),
+            window=next_window,
+            means_high=jnp.maximum(without_closing.means_high, means),
+            means_low=jnp.minimum(without_closing.means_low, means),
+            windows=without_closing.windows + 1.0,
+            means_beyond=without_closing.means_beyond + jnp.where(_sizes(mean) <= limits[1], 0.0, window),
+            relative_beyond=without_closing.relative_beyond + beyond,
         )
 
-    after = jax.lax.cond(closes, closed, lambda: still_open)
-    return guards.select(observed, after, tally)
+    after = jax.lax.cond(is_window_complete, close_window, lambda: without_closing)
+    return guards.select(is_observed, after, tally)
 
 
 def drift(tally: Tally) -> Float[Array, "4"]:
     """Return the largest difference between the means of two windows, (4,) [rad]."""
-    return _sizes_of(tally.means_high - tally.means_low)
+    return _sizes_from_projections(tally.means_high - tally.means_low)
 
 
 def _projections(error: Array) -> Array:
     """Return the error about each axis and along each direction across the boresight, (3 + DIRECTIONS,) [rad]."""
-    return jnp.concatenate([error[:3], np.cos(ALONG) * error[3] + np.sin(ALONG) * error[4]])
+    return jnp.concatenate([error[:3], np.cos(DIRECTION_ANGLES) * error[3] + np.sin(DIRECTION_ANGLES) * error[4]])
 
 
 def _sizes(error: Array) -> Array:
@@ -313,15 +318,15 @@ def _sizes(error: Array) -> Array:
     return jnp.append(jnp.abs(error[:3]), guards.norm(error[3:]))
 
 
-def _sizes_of(projections: Array) -> Array:
+def _sizes_from_projections(projections: Array) -> Array:
     """Return the sizes about each axis and of the half-cone, (4,) [rad], from projections, see `DIRECTIONS`."""
     return jnp.append(projections[:3], jnp.max(projections[3:]) / np.cos(0.5 * np.pi / DIRECTIONS))
 
 
 def _fraction_beyond(start: Array, end: Array, limits: Array) -> Array:
     """Return the fraction of an interval with sizes beyond the limits, if the sizes are linear in the interval."""
-    within, within_next = start <= limits, end <= limits
-    uncrossed = jnp.where(within & within_next, 0.0, 1.0)
-    crosses = within != within_next
-    change = jnp.where(crosses, jnp.abs(start - end), 1.0)
-    return jnp.where(crosses, (jnp.maximum(start, end) - limits) / change, uncrossed)
+    is_within, is_within_next = start <= limits, end <= limits
+    without_crossing = jnp.where(is_within & is_within_next, 0.0, 1.0)
+    is_crossing = is_within != is_within_next
+    change = jnp.where(is_crossing, jnp.abs(start - end), 1.0)
+    return jnp.where(is_crossing, (jnp.maximum(start, end) - limits) / change, without_crossing)

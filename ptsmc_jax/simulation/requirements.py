@@ -34,11 +34,11 @@ def must_keep(trials: int, quantile: float | None, confidence: float | None) -> 
         return None
     from ptsmc_jax.numerics.statistics import fraction_bound  # imports SciPy, which takes a while
 
-    def shown(within: int) -> bool:
+    def is_verified(within: int) -> bool:
         return fraction_bound(within, trials, confidence) >= quantile
 
     # the bound increases with the count, and reaches the quantile if all `trials` keep the limit
-    return 1 + bisect.bisect_left(range(1, trials), True, key=shown)
+    return 1 + bisect.bisect_left(range(1, trials), True, key=is_verified)
 
 
 def fewest_trials(quantile: float, confidence: float) -> int:
@@ -111,46 +111,49 @@ class Verdict:
 
     def __str__(self) -> str:
         """The verdict in one line."""
-        return self._of_trials() if self.fraction_of_time is None else self._of_time(self.fraction_of_time)
+        fraction = self.fraction_of_time
+        return self._describe_trials() if fraction is None else self._describe_time(fraction)
 
-    def _of_time(self, fraction: float) -> str:
+    def _describe_time(self, fraction: float) -> str:
         assert self.quantile is not None
-        most = quantity(self.limit, self.unit, 6)
-        whole = INTERPRETATIONS[self.interpretation]
-        requirement = f"{self.metric} at most {most} in {100 * self.quantile:g} % of {whole}"
+        limit = quantity(self.limit, self.unit, 6)
+        population = INTERPRETATIONS[self.interpretation]
+        requirement = f"{self.metric} at most {limit} in {100 * self.quantile:g} % of {population}"
         met = "met" if self.met else "NOT met"
         if self.interpretation == "temporal":
             beyond = "" if self.met or self.trials == 1 else f", {self.failures} of {self.trials} runs have less"
             return f"{requirement}: the least of a run is {percent(fraction)} %: {met}{beyond}"
-        seen = f"{percent(fraction)} %"
+        result = f"{percent(fraction)} %"
         if self.confidence is not None and self.shown is not None:
-            seen += f", at least {percent(self.shown)} % at {100 * self.confidence:g} % confidence"
-        return f"{requirement}: {seen}: {met}"
+            result += f", at least {percent(self.shown)} % at {100 * self.confidence:g} % confidence"
+        return f"{requirement}: {result}: {met}"
 
-    def _of_trials(self) -> str:
+    def _describe_trials(self) -> str:
         failures, trials, worst = self.failures, self.trials, self.worst
-        each = "loops" if self.metric in MARGINS else "trials"  # margins may be computed for more loops than trials
+        noun = "loops" if self.metric in MARGINS else "trials"  # margins may be computed for more loops than trials
         limit = quantity(self.limit, self.unit, 6)
         requirement = f"{self.metric} at {'least' if self.at_least else 'most'} {limit}"
         if self.quantile is not None:
             requirement += f" in {100 * self.quantile:g} % of trials"
             requirement += f" with {100 * self.confidence:g} % confidence" if self.confidence is not None else ""
         if self.at_least and not failures and not math.isfinite(worst):
-            seen = "unlimited"  # an infinite margin, which JSON cannot store
+            result = "unlimited"  # an infinite margin, which JSON cannot store
         elif math.isnan(worst):
-            seen = "no value" if trials == 1 else "no worst value"
+            result = "no value" if trials == 1 else "no worst value"
         else:
-            of_loops = f"of {trials} dispersed loops " if each == "loops" else ""
+            loop_count = f"of {trials} dispersed loops " if noun == "loops" else ""
             number = quantity(worst, self.unit, 4) if self.unit in ("rad", "rad/s") else f"{worst:.4g}"
-            seen = (f"worst {of_loops}" if trials > 1 else "") + number
+            result = (f"worst {loop_count}" if trials > 1 else "") + number
         least = must_keep(trials, self.quantile, self.confidence)
         if least is None and self.quantile is not None and self.confidence is not None:
-            few = fewest_trials(self.quantile, self.confidence)
-            return f"{requirement}: {seen}: NOT shown, which takes at least {few} trials"
+            fewest = fewest_trials(self.quantile, self.confidence)
+            return f"{requirement}: {result}: NOT shown, which takes at least {fewest} trials"
         if self.met:
-            return f"{requirement}: {seen}: met" + (f", beyond it {failures} of {trials} {each}" if failures else "")
+            return f"{requirement}: {result}: met" + (f", beyond it {failures} of {trials} {noun}" if failures else "")
         allowed = f", at most {trials - least} allowed" if least is not None and trials > least else ""
-        return f"{requirement}: {seen}: NOT met" + (f" in {failures} of {trials} {each}{allowed}" if trials > 1 else "")
+        return f"{requirement}: {result}: NOT met" + (
+            f" in {failures} of {trials} {noun}{allowed}" if trials > 1 else ""
+        )
 
 
 def quantity(value: float, unit: str, digits: int) -> str:
@@ -204,43 +207,43 @@ class Requirement:
             ok: whether each trial has finished, bool of the same shape.
             within: fraction of the time within the limit, same shape; needed if the requirement is on the time.
         """
-        single = np.ndim(values) == 0
+        is_single = np.ndim(values) == 0
         values, ok = np.atleast_1d(np.asarray(values)), np.atleast_1d(np.asarray(ok))
         if self.timed is not None and within is not None:
-            return self._of_time(values, ok, np.atleast_1d(np.asarray(within)), single=single)
-        keeps = ok & ((values >= self.limit) if self.at_least else (values <= self.limit))
-        of_ended = np.where(ok, values, np.nan)
-        worst = float(np.min(of_ended) if self.at_least else np.max(of_ended))
-        quantile, confidence = (None, None) if single else (self.quantile, self.confidence)
-        least = must_keep(values.size, quantile, confidence)
+            return self._verdict_on_time(values, ok, np.atleast_1d(np.asarray(within)), single=is_single)
+        is_within = ok & ((values >= self.limit) if self.at_least else (values <= self.limit))
+        finished_values = np.where(ok, values, np.nan)
+        worst = float(np.min(finished_values) if self.at_least else np.max(finished_values))
+        quantile, confidence = (None, None) if is_single else (self.quantile, self.confidence)
+        needed = must_keep(values.size, quantile, confidence)
         ordered = np.sort(np.where(ok & ~np.isnan(values), values, np.inf))
-        deciding = float(ordered[least - 1]) if least is not None else np.nan
+        quantile_value = float(ordered[needed - 1]) if needed is not None else np.nan
         margin = violation_ratio(
-            np.asarray(worst if least == values.size else deciding), self.limit, at_least=self.at_least
+            np.asarray(worst if needed == values.size else quantile_value), self.limit, at_least=self.at_least
         )
         return Verdict(
-            self.metric, self.limit, self.stated_unit, worst, float(margin), int(np.sum(~keeps)), int(values.size),
+            self.metric, self.limit, self.stated_unit, worst, float(margin), int(np.sum(~is_within)), int(values.size),
             quantile, confidence, self.at_least,
         )  # fmt: skip
 
-    def _of_time(self, values: np.ndarray, ok: np.ndarray, within: np.ndarray, *, single: bool) -> Verdict:
+    def _verdict_on_time(self, values: np.ndarray, ok: np.ndarray, within: np.ndarray, *, single: bool) -> Verdict:
         """Return the verdict on a fraction of the time. A run that failed never keeps the limit."""
         assert self.quantile is not None
         beyond = np.where(ok & ~np.isnan(within), 1.0 - within, 1.0)
         confidence = None if single else self.confidence
         if self.interpretation == "temporal":
-            least = shown = 1.0 - float(beyond.max())
+            fraction = shown = 1.0 - float(beyond.max())
             failures = int(np.sum(1.0 - beyond < self.quantile))
         else:
             from ptsmc_jax.numerics.statistics import mean_bound
 
-            least = 1.0 - float(beyond.mean())
-            shown = least if confidence is None else 1.0 - mean_bound(beyond, confidence)
+            fraction = 1.0 - float(beyond.mean())
+            shown = fraction if confidence is None else 1.0 - mean_bound(beyond, confidence)
             failures = int(np.sum(beyond > 0.0))
         worst, margin = float(np.max(np.where(ok, values, np.nan))), (1.0 - shown) / (1.0 - self.quantile)
         return Verdict(
             self.metric, self.limit, self.stated_unit, worst, margin, failures, int(values.size), self.quantile,
-            confidence, interpretation=self.interpretation, fraction_of_time=least, shown=shown,
+            confidence, interpretation=self.interpretation, fraction_of_time=fraction, shown=shown,
         )  # fmt: skip
 
 

@@ -16,7 +16,7 @@ from ptsmc_jax.numerics.draws import WholeNumber, check_fits
 from ptsmc_jax.numerics.pytrees import Scalar
 from ptsmc_jax.simulation import continuous, sampled
 from ptsmc_jax.simulation.assembly import Parts, check_parts
-from ptsmc_jax.simulation.computer import OURS, Software
+from ptsmc_jax.simulation.computer import PYTHON_SOFTWARE, Software
 from ptsmc_jax.simulation.interval import Criteria
 from ptsmc_jax.simulation.run_state import (
     DIVERGED,
@@ -54,7 +54,11 @@ __all__ = [
 
 
 def simulate(
-    parts: Parts, seed: WholeNumber = 0, trial: WholeNumber = 0, record: bool = False, software: Software = OURS
+    parts: Parts,
+    seed: WholeNumber = 0,
+    trial: WholeNumber = 0,
+    record: bool = False,
+    software: Software = PYTHON_SOFTWARE,
 ) -> Result:
     """Simulate one closed-loop run. A run that diverges raises nothing: its status reports it.
 
@@ -71,24 +75,24 @@ def simulate(
     Raises:
         TypeError: the parts do not fit together.
     """
-    _check(parts)
+    _check_fit(parts)
     ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
-    pointing = None if parts.pointing is None else parts.pointing.of_run(ticks.t.size)
+    pointing = None if parts.pointing is None else parts.pointing.for_run(ticks.t.size)
     criteria = Criteria(parts.controller.t_f, parts.t_end, parts.window, parts.settling_angle, pointing)
     target = parts.reference(jnp.zeros_like(parts.t_end))
     # the initial state may have integers or single precision; the run uses the precision of JAX
     x0 = jax.tree.map(lambda v: jnp.asarray(v, float), parts.aligned_initial)
     unit = parts.controller.kinematics.singularity_distance_unit(parts.controller.singularity_distance(x0, target))
     target_t_f = parts.reference(criteria.t_f)
-    unit, gap = jax.lax.stop_gradient(unit), _first_missing(parts, ticks)
+    unit, gap = jax.lax.stop_gradient(unit), _first_uncovered_time(parts, ticks)
     run = Run(parts, ticks, criteria, x0, target, target_t_f, unit, gap, record)
     return sampled.simulate(run, seed, trial, software) if parts.clock.sampled else continuous.simulate(run)
 
 
-def _check(parts: Parts) -> None:
+def _check_fit(parts: Parts) -> None:
     """Raise TypeError if the parts do not fit together or do not have the precision of JAX."""
     check_parts(parts)
-    _check_bits(parts.t_end)
+    _check_precision(parts.t_end)
     for name, shape in parts.plant.state_shapes.items():
         value = getattr(parts.initial, name, None) if name else parts.initial
         _check_shape(f"initial.{name}".rstrip("."), value, [shape])
@@ -101,45 +105,45 @@ def _check(parts: Parts) -> None:
 
 
 def _check_continuous(parts: Parts) -> None:
-    """Raise TypeError if parts of a continuous loop contain what only the sampled loop simulates."""
-    optional = [name for name in ("walk_rate", "command_filter", "jitter") if getattr(parts, name) is not None]
-    present = {"sensors": not parts.sensors.perfect, "actuators": not parts.actuators.ideal}
-    for name in (*(name for name, there in present.items() if there), *optional):
+    """Raise TypeError if parts of a continuous loop have devices that only the sampled loop simulates."""
+    only_sampled = [name for name in ("walk_rate", "command_filter", "jitter") if getattr(parts, name) is not None]
+    present = {"sensors": not parts.sensors.perfect, "actuators": not parts.actuators.is_ideal}
+    for name in (*(name for name, is_present in present.items() if is_present), *only_sampled):
         raise TypeError(f"the continuous loop cannot simulate {name}: remove {name}, or use a sampled clock")
     if not parts.controller.continuous:
         law = type(parts.controller).__name__
         raise TypeError(f"the law {law} needs the sampled loop: use a sampled clock")
 
 
-def _check_bits(time: Any) -> None:
-    """Raise TypeError if the parts were built while JAX had another precision."""
-    real = jnp.result_type(float)
-    if isinstance(time, jax.Array) and jnp.issubdtype(time.dtype, jnp.floating) and time.dtype != real:
-        had, has = (jnp.finfo(kind).bits for kind in (time.dtype, real))
-        built = f"the parts were built in {had}-bit precision, but JAX now uses {has}-bit"
-        raise TypeError(f"{built}; build them again with study")
+def _check_precision(time: Any) -> None:
+    """Raise TypeError if the parts were built while JAX used another precision."""
+    jax_type = jnp.result_type(float)
+    if isinstance(time, jax.Array) and jnp.issubdtype(time.dtype, jnp.floating) and time.dtype != jax_type:
+        parts_bits, jax_bits = (jnp.finfo(dtype).bits for dtype in (time.dtype, jax_type))
+        message = f"the parts were built in {parts_bits}-bit precision, but JAX now uses {jax_bits}-bit"
+        raise TypeError(f"{message}; build them again with study")
 
 
 def _check_shape(name: str, value: Any, allowed: list[tuple[int, ...]]) -> None:
     shape = getattr(value, "shape", None)
     if shape not in allowed:
-        found = f"of type {type(value).__name__}" if shape is None else f"one of shape {shape}"
-        raise TypeError(f"{name} must be an array {allowed[0]}, but is {found}")
+        actual = f"of type {type(value).__name__}" if shape is None else f"one of shape {shape}"
+        raise TypeError(f"{name} must be an array {allowed[0]}, but is {actual}")
 
 
-def _gap(ticks: Ticks, t_end: Scalar) -> Scalar:
+def _first_time_without_samples(ticks: Ticks, t_end: Scalar) -> Scalar:
     """Return the first time without samples [s], or NaN. A clock built for a shorter t_f or delta has too few."""
     first, last = ticks.t[0], ticks.t_next[-1]
-    ends = jnp.where(last < t_end - guards.time_tolerance(t_end, t_end), last, jnp.nan)
-    return jax.lax.stop_gradient(jnp.where(first > 0.0, 0.0, ends))
+    end_of_samples = jnp.where(last < t_end - guards.time_tolerance(t_end, t_end), last, jnp.nan)
+    return jax.lax.stop_gradient(jnp.where(first > 0.0, 0.0, end_of_samples))
 
 
-def _first_missing(parts: Parts, ticks: Ticks) -> Scalar:
-    """Return the first time without samples [s], or NaN; 0 if the steps of a continuous loop are too coarse."""
+def _first_uncovered_time(parts: Parts, ticks: Ticks) -> Scalar:
+    """Return the first time that the clock does not cover [s], or NaN; 0 if continuous steps are too coarse."""
     clock: Any = parts.clock
-    gap = _gap(ticks, parts.t_end)
+    gap = _first_time_without_samples(ticks, parts.t_end)
     law = parts.controller
-    return gap if clock.sampled else jnp.where(clock.too_coarse(law.t_f, law.delta), 0.0, gap)
+    return gap if clock.sampled else jnp.where(clock.is_too_coarse(law.t_f, law.delta), 0.0, gap)
 
 
 class _SimulateProgram(programs.Program):
@@ -157,10 +161,10 @@ class _SimulateProgram(programs.Program):
 # one compiled program for all parts of the same structure
 simulate_parts = _SimulateProgram(simulate, ("record", "software"), title="the simulation")
 # the same function for a single run: compiles 2 to 10 times as fast, and runs 3 to 8 times as slowly
-simulate_once = _SimulateProgram(simulate, ("record", "software"), programs.QUICKLY, title="the simulation")
-LONG = 20_000  # periods of a run. Longer runs are worth a slow compilation.
+simulate_once = _SimulateProgram(simulate, ("record", "software"), programs.FAST_COMPILE, title="the simulation")
+LONG_RUN = 20_000  # number of control periods above which the slower compilation of `simulate_parts` pays off
 
 
 def single_run_program(parts: Parts) -> programs.Program:
     """Return the compiled `simulate` that is fastest for a single run, compilation included."""
-    return simulate_parts if parts.clock.count > LONG else simulate_once
+    return simulate_parts if parts.clock.count > LONG_RUN else simulate_once

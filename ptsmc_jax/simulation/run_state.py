@@ -101,7 +101,7 @@ def begin(run: Run) -> Score:
     start = Start(snapshot, parts.plant.inputs, momentum, measured=not parts.sensors.perfect)
     running = metrics.begin(start, run.criteria)
     score = Score(snapshot, running, jnp.int32(OK), jnp.full_like(zero, jnp.nan))
-    return _judged(run, score, run.x0, run.target_0, zero, zero, no_torque)
+    return _check_state(run, score, run.x0, run.target_0, zero, zero, no_torque)
 
 
 def advance(run: Run, score: Score, before: State, after: State, record: Record) -> Score:
@@ -117,10 +117,10 @@ def advance(run: Run, score: Score, before: State, after: State, record: Record)
     kinematics, criteria, now = run.parts.controller.kinematics, run.criteria, record.now
     target_next = run.parts.reference(now.t_next)
     snapshot = _snapshot(run.parts, target_next, after.x)
-    begun, ended, length = (before.x, record.decision.target), (after.x, target_next), now.t_next - now.t
+    at_start, at_end, length = (before.x, record.decision.target), (after.x, target_next), now.t_next - now.t
 
     def errors() -> Errors:
-        return Errors(*kinematics.errors(*begun), *kinematics.errors(*ended))
+        return Errors(*kinematics.errors(*at_start), *kinematics.errors(*at_end))
 
     def arrival() -> Arrival:
         x = record.x_at(criteria.t_f)
@@ -129,19 +129,19 @@ def advance(run: Run, score: Score, before: State, after: State, record: Record)
     attitude_error = knowledge_error = None
     if criteria.pointing is not None:
         frame = criteria.pointing.frame
-        attitude_error = partial(pointing.error_path, begun, ended, frame, length)
+        attitude_error = partial(pointing.error_path, at_start, at_end, frame, length)
         if after.computer.seen is not None:
             knowledge_error = partial(pointing.constant_path, after.computer.seen.q, before.x.q, frame, length)
     interval = Interval(
-        now.t, now.t_next, score.snapshot, snapshot, errors, partial(kinematics.middle_angle, begun, ended, length),
+        now.t, now.t_next, score.snapshot, snapshot, errors, partial(kinematics.middle_angle, at_start, at_end, length),
         arrival, before.torque, record.torques, attitude_error, knowledge_error,
     )  # fmt: skip
     score = score._replace(snapshot=snapshot, running=metrics.update(score.running, interval, criteria))
     u_end = record.torques.delivered[-1]
-    return _judged(run, score, after.x, target_next, now.t_next, record.step, u_end, after.computer.law)
+    return _check_state(run, score, after.x, target_next, now.t_next, record.step, u_end, after.computer.law)
 
 
-def row(run: Run, before: State, after: State, record: Record, tick: Tick | None = None) -> Log:
+def history_row(run: Run, before: State, after: State, record: Record, tick: Tick | None = None) -> Log:
     """Return the row of the history at the start of a control period or of a step of the continuous loop.
 
     Args:
@@ -156,16 +156,16 @@ def row(run: Run, before: State, after: State, record: Record, tick: Tick | None
     if drive is not None and record.torques.wheel_torque is not None:
         wheels = drive.h, record.torques.wheel_torque[0]
     u, has_length = record.torques.delivered[0], now.t_next > now.t
-    found = row_at(run, now.t, before.x, decision, u, has_length, after.walk, wheels)
+    row = history_row_at(run, now.t, before.x, decision, u, has_length, after.walk, wheels)
     if tick is None:
-        return found
+        return row
     # the flight software measured the same; the compiler merges both computations
     parts, memory, seen = run.parts, before.computer.sensors, run.parts.plant.visible(before.x)
     readings, _ = parts.sensors.inputs(memory, seen, tick.now, tick.dt_before, before.star_x)
-    return found._replace(readings=readings, sent=parts.actuators.send(before.actuators, decision.u, decision.w)[0])
+    return row._replace(readings=readings, sent=parts.actuators.send(before.actuators, decision.u, decision.w)[0])
 
 
-def row_at(
+def history_row_at(
     run: Run, t: Scalar, x: Any, decision: Decision, u: Array, has_length: Array, walk: Any = None, wheels: Any = None
 ) -> Log:
     """Return a row of the history.
@@ -188,50 +188,54 @@ def row_at(
 
 def history(rows: Log, last: Log) -> Log:
     """Append the last row to the rows of the history, arrays (time, ...)."""
-    return jax.tree.map(lambda many, one: jnp.concatenate([many, jnp.asarray(one)[None]]), rows, last)
+    return jax.tree.map(lambda column, value: jnp.concatenate([column, jnp.asarray(value)[None]]), rows, last)
 
 
-def finish(run: Run, first: Score, score: Score, log: Log | None, samples: dict[str, Array] | None = None) -> Result:
+def finish(run: Run, initial: Score, score: Score, log: Log | None, samples: dict[str, Array] | None = None) -> Result:
     """Return the result of a run.
 
     Args:
         run: constants of the run.
-        first: metrics and status at t = 0.
+        initial: metrics and status at t = 0.
         score: metrics and status at t_end.
         log: history, or None.
         samples: see `Result`.
     """
     criteria, angle_at_t_f = run.criteria, score.running.arrival.angle
     values = metrics.finish(score.running, criteria)
-    unbounded = (score.status == OK) & metrics.unbounded(values)
-    not_converged = (score.status == OK) & is_not_converged(angle_at_t_f, first.snapshot.angle, criteria.settling_angle)
-    cut = ~jnp.isnan(run.gap) & ~(score.bad_time < run.gap)  # later statuses mean nothing without samples
+    unbounded = (score.status == OK) & metrics.is_unbounded(values)
+    not_converged = (score.status == OK) & is_not_converged(
+        angle_at_t_f, initial.snapshot.angle, criteria.settling_angle
+    )
+    is_incomplete = ~jnp.isnan(run.gap) & ~(score.bad_time < run.gap)  # a status after the gap has no meaning
     status = jnp.where(unbounded, UNBOUNDED, jnp.where(not_converged, NOT_CONVERGED, score.status))
-    status = jnp.where(cut, INCOMPLETE, status).astype(jnp.int32)
+    status = jnp.where(is_incomplete, INCOMPLETE, status).astype(jnp.int32)
     bad_time = jnp.where(unbounded, criteria.t_end, jnp.where(not_converged, criteria.t_f, score.bad_time))
-    bad_time = jnp.where(cut, run.gap, bad_time)
+    bad_time = jnp.where(is_incomplete, run.gap, bad_time)
     return Result(values, status, bad_time, log, samples or {})
 
 
-def is_not_converged(angle_at_t_f: Scalar, first: Scalar, settling_angle: Scalar) -> Array:
+def is_not_converged(angle_at_t_f: Scalar, initial_angle: Scalar, settling_angle: Scalar) -> Array:
     """Return whether a completed run has not converged at t_f.
 
     Args:
         angle_at_t_f: angle to the reference at t_f [rad].
-        first: angle to the reference at t = 0 [rad].
+        initial_angle: angle to the reference at t = 0 [rad].
         settling_angle: settling angle of the scenario [rad].
     """
-    return angle_at_t_f > jnp.maximum(NOT_CONVERGED_FRACTION * first, NOT_CONVERGED_SETTLING_ANGLES * settling_angle)
+    return angle_at_t_f > jnp.maximum(
+        NOT_CONVERGED_FRACTION * initial_angle, NOT_CONVERGED_SETTLING_ANGLES * settling_angle
+    )
 
 
 def _snapshot(parts: Parts, target: Any, x: Any) -> Snapshot:
     angle, plant = parts.controller.kinematics.angle(x, target), parts.plant
     momentum = plant.momentum(x)
-    size = None if momentum is None else guards.norm(momentum)
-    return Snapshot(angle, plant.speed(x), size, plant.modal_amplitude(x))
+    momentum_norm = None if momentum is None else guards.norm(momentum)
+    return Snapshot(angle, plant.speed(x), momentum_norm, plant.modal_amplitude(x))
 
 
-def _judged(
+def _check_state(
     run: Run, score: Score, x: Any, target: Any, t: Scalar, step: Scalar, u: Array, memory: Any = None
 ) -> Score:
     """Check the state at t, and return the score with status and `bad_time` of the first failure.
@@ -239,10 +243,16 @@ def _judged(
     Exported code rejects a memory of the law that is not finite, so the simulated run counts as diverged, too.
     """
     law, plant = run.parts.controller, run.parts.plant
-    numbers = [leaf for leaf in jax.tree.leaves((x, u, memory)) if jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.inexact)]
-    finite = jnp.isfinite(sum(jnp.sum(leaf) for leaf in numbers))
-    fast = plant.too_fast(x, step)
-    near = ~(law.singularity_distance(x, target) / run.singularity_distance_unit >= SINGULAR_DISTANCE)
-    code = jnp.where(~finite, DIVERGED, jnp.where(near, SINGULAR, jnp.where(fast, TOO_FAST, OK))).astype(jnp.int32)
-    first = (score.status == OK) & (code != OK)
-    return score._replace(status=jnp.where(first, code, score.status), bad_time=jnp.where(first, t, score.bad_time))
+    real_leaves = [
+        leaf for leaf in jax.tree.leaves((x, u, memory)) if jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.inexact)
+    ]
+    is_finite = jnp.isfinite(sum(jnp.sum(leaf) for leaf in real_leaves))
+    is_too_fast = plant.is_too_fast(x, step)
+    is_singular = ~(law.singularity_distance(x, target) / run.singularity_distance_unit >= SINGULAR_DISTANCE)
+    code = jnp.where(
+        ~is_finite, DIVERGED, jnp.where(is_singular, SINGULAR, jnp.where(is_too_fast, TOO_FAST, OK))
+    ).astype(jnp.int32)
+    is_first_failure = (score.status == OK) & (code != OK)
+    return score._replace(
+        status=jnp.where(is_first_failure, code, score.status), bad_time=jnp.where(is_first_failure, t, score.bad_time)
+    )

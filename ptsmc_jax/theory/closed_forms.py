@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ptsmc_jax.laws.prescribed_time import expansion, rising_factorials
+from ptsmc_jax.laws.prescribed_time import rising_factorials, surface_coefficients
 from ptsmc_jax.numerics.pytrees import Scalar
 
 Vector = Float[Array, " n"]
@@ -67,8 +67,8 @@ def exact_chain(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector) -> ChainMotion:
     """
     n = x0.shape[0]
     s0 = surface_at_start(t_f, eta, x0)
-    y = [free + s0 * forced for free, forced in zip(*modes(t, t_f, eta, x0), strict=True)]
-    x = from_modes(t, t_f, eta, y)
+    y = [free + s0 * forced for free, forced in zip(*scaled_responses(t, t_f, eta, x0), strict=True)]
+    x = derivatives_from_scaled(t, t_f, eta, y)
     return ChainMotion(jnp.stack(x[:n]), s0 * ((t_f - t) / t_f) ** (eta + n - 2), x[n])
 
 
@@ -80,11 +80,11 @@ def surface_at_start(t_f: Scalar, eta: Scalar, x: Vector) -> Scalar:
         eta: exponent of the law [-].
         x: states at t = 0, (n,), in the states' own units.
     """
-    c = expansion(eta, x.shape[0])
+    c = surface_coefficients(eta, x.shape[0])
     return sum((c[i] * t_f**i * x[i] for i in range(x.shape[0])), jnp.zeros_like(t_f))
 
 
-def modes(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector) -> tuple[list[Scalar], list[Scalar]]:
+def scaled_responses(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector) -> tuple[list[Scalar], list[Scalar]]:
     """Return the two parts of y, y', .. y^(n) for y = x_1 / r^eta: the free response and the response to s(0) = 1.
 
     Args:
@@ -98,16 +98,16 @@ def modes(t: Scalar, t_f: Scalar, eta: Scalar, x0: Vector) -> tuple[list[Scalar]
     """
     n, tau = x0.shape[0], t_f - t
     rising = rising_factorials(eta, n)
-    start = [
+    initial = [
         sum((math.comb(k, j) * x0[j] * rising[k - j] * t_f ** (j - k) for j in range(k + 1)), jnp.zeros_like(t))
         for k in range(n - 1)
     ]
     free, forced = [], []
     for j in range(n + 1):
-        terms = (start[k] * t ** (k - j) / math.factorial(k - j) for k in range(j, n - 1))
+        terms = (initial[k] * t ** (k - j) / math.factorial(k - j) for k in range(j, n - 1))
         free.append(sum(terms, jnp.zeros_like(t)))
-        gained = _integral(t, t_f, n - 2 - j) if j < n - 1 else tau ** (n - 2 - j)
-        forced.append(t_f ** (2 - n) * gained)
+        integral = _integral(t, t_f, n - 2 - j) if j < n - 1 else tau ** (n - 2 - j)
+        forced.append(t_f ** (2 - n) * integral)
     return free, forced
 
 
@@ -120,20 +120,20 @@ def _integral(t: Scalar, t_f: Scalar, p: int) -> Scalar:
     return total / math.factorial(p)
 
 
-def from_modes(t: Scalar, t_f: Scalar, eta: Scalar, y: list[Scalar], size=lambda v: v) -> list[Scalar]:
+def derivatives_from_scaled(t: Scalar, t_f: Scalar, eta: Scalar, y: list[Scalar], apply=lambda v: v) -> list[Scalar]:
     """Return x_1, x_1', .. of x_1 = r^eta y by Leibniz's rule, as many as y has values.
 
     Args:
         t: time since the start of the run [s], in the approach phase.
         t_f: prescribed time [s].
         eta: exponent of the law [-].
-        y: y, y', .. at t, see `modes`.
-        size: function applied to each factor of y. With `abs`, bounds on y give bounds on x_1 and its derivatives.
+        y: y, y', .. at t, see `scaled_responses`.
+        apply: function applied to each factor of y. With `abs`, bounds on y give bounds on x_1 and its derivatives.
     """
     r = (t_f - t) / t_f
     falling = [jnp.ones_like(eta)]
     for k in range(len(y)):
         falling.append(-falling[-1] * (eta - k))
-    derivatives = [size(falling[p] * r ** (eta - p) * t_f**-p) for p in range(len(y))]
+    derivatives = [apply(falling[p] * r ** (eta - p) * t_f**-p) for p in range(len(y))]
     zero = jnp.zeros_like(r)
     return [sum((math.comb(k, j) * derivatives[k - j] * y[j] for j in range(k + 1)), zero) for k in range(len(y))]

@@ -1,7 +1,7 @@
 """Frequency response of an opened loop on a grid, and the grid intervals that contain the crossings of the margins.
 
-Read `grid` and `brackets` first. A Schur decomposition makes A triangular. Each solution with z I - A is then a
-substitution, state by state, for all grid points at once.
+A Schur decomposition makes A triangular. Each solution with z I - A is then a substitution, state by state, for all
+grid points at once. Read `frequency_grid` and `find_brackets` first.
 """
 
 from typing import Any, NamedTuple
@@ -14,13 +14,14 @@ from jaxtyping import Array, ArrayLike, Complex, Float
 from ptsmc_jax.theory.linear import Opening
 
 LOWEST, POINTS = 1e-6, 240  # Lowest grid frequency as a fraction of the Nyquist frequency; grid size without poles.
-AROUND = np.array([-3.0, -1.0, -0.3, 0.3, 1.0, 3.0])  # Offsets of grid points from a pole, in units of its damping.
+# offsets of grid points from a pole, in units of the pole's damping
+POLE_OFFSETS = np.array([-3.0, -1.0, -0.3, 0.3, 1.0, 3.0])
 NEAREST = 3  # Number of crossings of each kind that are refined.
-SPLIT = (2 * NEAREST, 3 * NEAREST)  # Indices that split the crossings: L real, |L| = 1, L nearest to -1.
-REAL = 1e-2  # L counts as real at an end of the grid if |Im L / Re L| is smaller.
-EVEN = 1e-6  # Relative differences of |L| below this count as zero, for grid points that coincide.
+KIND_ENDS = (2 * NEAREST, 3 * NEAREST)  # Indices that split the crossings: L real, |L| = 1, L nearest to -1.
+REAL_TOLERANCE = 1e-2  # L counts as real at an end of the grid if |Im L / Re L| is smaller.
+EQUAL_TOLERANCE = 1e-6  # Relative differences of |L| below this count as zero, for grid points that coincide.
 CHUNK = 64  # Number of grid points in one evaluation of L, small enough for the processor's cache.
-MOST = 100.0  # dB. Larger gain margins count as infinite; peak sensitivity reported for an unstable loop.
+LARGEST_MARGIN = 100.0  # dB. Larger gain margins count as infinite; peak sensitivity reported for an unstable loop.
 
 
 def poles_of(opening: Opening) -> Complex[Array, "loops n"]:
@@ -29,11 +30,11 @@ def poles_of(opening: Opening) -> Complex[Array, "loops n"]:
     The sensitivity may peak near the poles of the closed loop, and L of an axis near those of the loop open there.
     """
     m = opening.c.shape[0]
-    closed = jnp.asarray(np.append(np.ones((1, m)), 1.0 - np.eye(m), axis=0))
-    return jax.lax.map(lambda on: jnp.linalg.eigvals(opening.closed(jnp.diag(on))), closed)
+    closed_axes = jnp.asarray(np.append(np.ones((1, m)), 1.0 - np.eye(m), axis=0))
+    return jax.lax.map(lambda gains: jnp.linalg.eigvals(opening.closed(jnp.diag(gains))), closed_axes)
 
 
-def grid(poles: Complex[Array, "loops n"], h: Any) -> Float[Array, " points"]:
+def frequency_grid(poles: Complex[Array, "loops n"], h: Any) -> Float[Array, " points"]:
     """Return grid frequencies [rad/s] for a period h [s], denser toward 0, the Nyquist frequency and the poles."""
     low = np.geomspace(LOWEST, 0.5, POINTS // 2, endpoint=False)
     high = 1.0 - np.append(0.5 * np.geomspace(1.0, 1e-4, POINTS // 4), 0.0)
@@ -41,9 +42,9 @@ def grid(poles: Complex[Array, "loops n"], h: Any) -> Float[Array, " points"]:
     upper = jnp.argsort(-poles.imag, axis=1)[:, : (poles.shape[1] + 1) // 2]  # one pole of each conjugate pair
     poles = jnp.take_along_axis(poles, upper, axis=1).reshape(-1)
     damping = jnp.clip(jnp.abs(jnp.log(jnp.maximum(jnp.abs(poles), 1e-12))) / jnp.pi, LOWEST, 1.0)
-    near = jnp.abs(jnp.angle(poles))[None] / jnp.pi + AROUND[:, None] * damping[None]
-    both = jnp.append(jnp.asarray(base), jnp.clip(jnp.nan_to_num(near), LOWEST, 1.0))
-    return jnp.sort(both) * jnp.pi / h
+    near_poles = jnp.abs(jnp.angle(poles))[None] / jnp.pi + POLE_OFFSETS[:, None] * damping[None]
+    frequencies = jnp.append(jnp.asarray(base), jnp.clip(jnp.nan_to_num(near_poles), LOWEST, 1.0))
+    return jnp.sort(frequencies) * jnp.pi / h
 
 
 class SchurOpening(NamedTuple):
@@ -52,33 +53,33 @@ class SchurOpening(NamedTuple):
     opening: Opening  # With a triangular A.
     axes: Array  # (n, n) unitary, with the Schur vectors as columns.
 
-    def halves(self, z: Complex[Array, " points"]) -> tuple[Array, Array]:
+    def resolvent_products(self, z: Complex[Array, " points"]) -> tuple[Array, Array]:
         """Return X = (z I - A)^-1 B and Y' of Y = C (z I - A)^-1, (n, m, points) each, in Schur coordinates."""
         a, n = self.opening.a, self.opening.a.shape[0]
 
-        def solved(rest: Array, b: Array, *, up: bool) -> Array:
+        def substitute(off_diagonal: Array, b: Array, *, up: bool) -> Array:
             """Return (z I - A)^-1 b by substitution, for all points at once; rest: A without its diagonal."""
 
-            def state(k: Array, x: Array) -> Array:
+            def eliminate(k: Array, x: Array) -> Array:
                 i = n - 1 - k if up else k
-                own = x[i] / (z - a[i, i])[None]  # substitution by columns is three times as fast as by rows
-                return (x + rest[:, i][:, None, None] * own[None]).at[i].set(own)
+                solution = x[i] / (z - a[i, i])[None]  # substitution by columns is three times as fast as by rows
+                return (x + off_diagonal[:, i][:, None, None] * solution[None]).at[i].set(solution)
 
-            return jax.lax.fori_loop(0, n, state, jnp.broadcast_to(b[:, :, None] + 0j, (*b.shape, z.size)))
+            return jax.lax.fori_loop(0, n, eliminate, jnp.broadcast_to(b[:, :, None] + 0j, (*b.shape, z.size)))
 
-        rest = jnp.triu(a, 1)
-        return solved(rest, self.opening.b, up=True), solved(rest.T, self.opening.c.T, up=False)
+        off_diagonal = jnp.triu(a, 1)
+        return substitute(off_diagonal, self.opening.b, up=True), substitute(off_diagonal.T, self.opening.c.T, up=False)
 
     def response(self, z: Complex[Array, " points"]) -> tuple[Array, Array]:
         """Return L [-] at many z and its derivative by z, (points, m, m) each."""
-        x, y = self.halves(z)
+        x, y = self.resolvent_products(z)
         return -jnp.einsum("kn,nmp->pkm", self.opening.c, x), jnp.einsum("nkp,nmp->pkm", y, x)
 
-    def values(self, z: Complex[Array, " points"]) -> Complex[Array, "points m m"]:
+    def response_in_chunks(self, z: Complex[Array, " points"]) -> Complex[Array, "points m m"]:
         """Return L [-] at any number of z, evaluated in chunks of `CHUNK` points."""
         chunks = jnp.resize(z, (-(-z.size // CHUNK), CHUNK))
-        each = jax.lax.map(lambda z: self.response(z)[0], chunks)
-        return each.reshape(-1, *each.shape[2:])[: z.size]
+        responses = jax.lax.map(lambda z: self.response(z)[0], chunks)
+        return responses.reshape(-1, *responses.shape[2:])[: z.size]
 
 
 def schur_form(a: ArrayLike) -> tuple[Array, Array]:
@@ -87,105 +88,106 @@ def schur_form(a: ArrayLike) -> tuple[Array, Array]:
     return upper, axes
 
 
-def in_schur_coordinates(opening: Opening, known: tuple[Array, Array] | None = None) -> SchurOpening:
+def in_schur_coordinates(opening: Opening, schur: tuple[Array, Array] | None = None) -> SchurOpening:
     """Transform the state space of an opened loop L [-] to Schur coordinates, where A is triangular.
 
     Args:
         opening: the opened loop.
-        known: result of `schur_form` for its A, or None to compute it.
+        schur: result of `schur_form` for its A, or None to compute it.
     """
     fixed = jax.lax.stop_gradient(opening)
-    a, axes = known or schur_form(fixed.a)
+    a, axes = schur or schur_form(fixed.a)
     return SchurOpening(Opening(a, jnp.conj(axes.T) @ fixed.b, fixed.c @ axes), axes)
 
 
-def response(opening: Opening, quick: SchurOpening, z: Complex[Array, " points"]) -> tuple[Array, Array]:
+def response(opening: Opening, schur: SchurOpening, z: Complex[Array, " points"]) -> tuple[Array, Array]:
     """Return L [-] at many z and its derivative by z, (points, m, m) each. L has gradients by `opening`.
 
-    L = Y (z X - A X - B) - C X with X and Y of `SchurOpening.halves`, whose gradients are stopped. The bracket is zero
-    for an exact X. Rounding errors of X and Y, and their dependence on the loop, therefore enter in second order only.
+    L = Y (z X - A X - B) - C X with X and Y of `SchurOpening.resolvent_products`, whose gradients are stopped. The
+    bracket is zero for an exact X. Therefore L depends on errors of X and Y, and on their gradients, only in second
+    order.
 
     Args:
         opening: the opened loop.
-        quick: the same loop in Schur coordinates.
+        schur: the same loop in Schur coordinates.
         z: points e^(i w h).
     """
-    x, y = jax.lax.stop_gradient(quick.halves(z))
-    x = jnp.einsum("ij,jmp->imp", quick.axes, x)
-    y = jnp.einsum("ij,jmp->imp", jnp.conj(quick.axes), y)
-    off = z[None, None] * x - jnp.einsum("ij,jmp->imp", opening.a, x) - opening.b[:, :, None]
-    L = jnp.einsum("nkp,nmp->pkm", y, off) - jnp.einsum("kn,nmp->pkm", opening.c, x)
+    x, y = jax.lax.stop_gradient(schur.resolvent_products(z))
+    x = jnp.einsum("ij,jmp->imp", schur.axes, x)
+    y = jnp.einsum("ij,jmp->imp", jnp.conj(schur.axes), y)
+    residual = z[None, None] * x - jnp.einsum("ij,jmp->imp", opening.a, x) - opening.b[:, :, None]
+    L = jnp.einsum("nkp,nmp->pkm", y, residual) - jnp.einsum("kn,nmp->pkm", opening.c, x)
     return L, jnp.einsum("nkp,nmp->pkm", y, x)
 
 
 @jax.jit
-def one_axis(response: Complex[Array, "m m"], axis: Any) -> Complex[Array, ""]:
+def axis_response(response: Complex[Array, "m m"], axis: Any) -> Complex[Array, ""]:
     """Return L [-] of one axis with all other axes closed.
 
     The function closes the other axes one after the other. Closing axis j subtracts L e_j e_j' L / (1 + L_jj) from L.
     This loop compiles much faster than the solution of a linear system.
     """
-    each = jnp.eye(response.shape[0])
-    own = each[axis]
+    unit_vectors = jnp.eye(response.shape[0])
+    selected = unit_vectors[axis]
 
-    def closed(L: Array, other: Array) -> tuple[Array, None]:
+    def close_axis(L: Array, other: Array) -> tuple[Array, None]:
         column, row = L @ other, other @ L
-        back = jnp.where(other @ own > 0.0, 0.0, 1.0 / (1.0 + row @ other))
-        return L - back * column[:, None] * row[None], None
+        gain = jnp.where(other @ selected > 0.0, 0.0, 1.0 / (1.0 + row @ other))
+        return L - gain * column[:, None] * row[None], None
 
-    return own @ jax.lax.scan(closed, response, each)[0] @ own
+    return selected @ jax.lax.scan(close_axis, response, unit_vectors)[0] @ selected
 
 
-def each_axis(response: Complex[Array, "points m m"]) -> Complex[Array, "points m"]:
+def axis_responses(response: Complex[Array, "points m m"]) -> Complex[Array, "points m"]:
     """Return L [-] of every axis with the other axes closed, at many points."""
     axes = jnp.arange(response.shape[1])
-    return jax.vmap(jax.vmap(one_axis, (None, 0)), (0, None))(response, axes)
+    return jax.vmap(jax.vmap(axis_response, (None, 0)), (0, None))(response, axes)
 
 
 class Brackets(NamedTuple):
     """Grid intervals with crossings, (places,): `NEAREST` intervals of each of four kinds.
 
     The kinds are: L real and -1 with more gain; L real and -1 with less gain; |L| = 1; |1 + L| smallest. If there are
-    fewer crossings of a kind, the remaining entries have `there` = False.
+    fewer crossings of a kind, the remaining entries have `exists` = False.
     """
 
     low: Array  # [rad/s] Lower end.
     high: Array  # [rad/s] Upper end.
     at_low: Array  # Value at the lower end of the function with a zero in the interval: `sine`, ln |L|, d|1 + L|^2/dw.
     at_high: Array  # Value of this function at the upper end.
-    there: Array  # bool
-    elsewhere: Array  # [rad/s] Further frequencies to evaluate: the grid point with L nearest to -1, and both ends.
+    exists: Array  # bool
+    further: Array  # [rad/s] Further frequencies to evaluate: the grid point with L nearest to -1, and both ends.
 
 
-def brackets(w: Array, L: Array) -> Brackets:
+def find_brackets(w: Array, L: Array) -> Brackets:
     """Return the grid intervals that contain crossings of one axis.
 
     Args:
         w: grid frequencies (points,) [rad/s], ascending.
         L: values of L at these frequencies (points,) [-].
     """
-    turned, size, near = sine(L), jnp.log(jnp.abs(L)), jnp.abs(1.0 + L) ** 2
-    real, factor = real_at(L)
+    phase_sine, size, distance = sine(L), jnp.log(jnp.abs(L)), jnp.abs(1.0 + L) ** 2
+    real, factor = real_axis_crossings(L)
     # the tolerance of 0.1 keeps crossings near -1, because refinement may move them to the other side of -1
     more, less = (jnp.where(real & (side * factor > -0.1), side * factor, jnp.inf) for side in (1.0, -1.0))
-    even, phase = unit_gain_at(L)
-    least = (near[1:-1] <= near[:-2]) & (near[1:-1] <= near[2:])
-    nearest = jnp.append(jnp.inf, jnp.where(least, near[1:-1], jnp.inf))
-    how_far = (more, less, jnp.where(even, jnp.abs(phase), jnp.inf), nearest)
-    values, places = zip(*map(smallest_values, how_far), strict=True)
+    unit_gain, phase = unit_gain_crossings(L)
+    is_minimum = (distance[1:-1] <= distance[:-2]) & (distance[1:-1] <= distance[2:])
+    nearest = jnp.append(jnp.inf, jnp.where(is_minimum, distance[1:-1], jnp.inf))
+    distances = (more, less, jnp.where(unit_gain, jnp.abs(phase), jnp.inf), nearest)
+    values, places = zip(*map(smallest_values, distances), strict=True)
     j, k = jnp.concatenate(places[:3]), jnp.maximum(places[3], 1)
-    derivative = (near[1:] - near[:-1]) / jnp.where(w[1:] == w[:-1], 1.0, w[1:] - w[:-1]) / 2
+    derivative = (distance[1:] - distance[:-1]) / jnp.where(w[1:] == w[:-1], 1.0, w[1:] - w[:-1]) / 2
 
-    def crossed(at: Array) -> Array:
-        return jnp.append(turned[at][: SPLIT[0]], size[at][SPLIT[0] :])
+    def crossing_values(at: Array) -> Array:
+        return jnp.append(phase_sine[at][: KIND_ENDS[0]], size[at][KIND_ENDS[0] :])
 
     return Brackets(
         low=jnp.append(w[j], w[k - 1]),
         high=jnp.append(w[j + 1], w[k + 1]),
-        at_low=jnp.append(crossed(j), derivative[k - 1]),
-        at_high=jnp.append(crossed(j + 1), derivative[k]),
-        there=jnp.isfinite(jnp.concatenate(values)),
-        elsewhere=w[jnp.stack([jnp.argmin(near), 0, -1])],
+        at_low=jnp.append(crossing_values(j), derivative[k - 1]),
+        at_high=jnp.append(crossing_values(j + 1), derivative[k]),
+        exists=jnp.isfinite(jnp.concatenate(values)),
+        further=w[jnp.stack([jnp.argmin(distance), 0, -1])],
     )
 
 
@@ -197,65 +199,65 @@ def sine(L: Array) -> Array:
 
 def smallest_values(values: Array, count: int = NEAREST) -> tuple[Array, Array]:
     """Return the `count` smallest values, in ascending order, and their indices. Faster than sorting all values."""
-    least, places = [], []
+    smallest, places = [], []
     for _ in range(count):
         place = jnp.argmin(values)
-        least.append(values[place])
+        smallest.append(values[place])
         places.append(place)
         values = jnp.where(jnp.arange(values.size) == place, jnp.inf, values)  # `.at[]` is a slow scatter under vmap
-    return jnp.stack(least), jnp.stack(places)
+    return jnp.stack(smallest), jnp.stack(places)
 
 
-def real_at(L: Array) -> tuple[Array, Array]:
+def real_axis_crossings(L: Array) -> tuple[Array, Array]:
     """Return which intervals have a crossing of the negative real axis by L [-], and ln of the gain that makes L = -1.
 
-    Crossings that need a gain change of more than `MOST` are ignored, because such a large L is rounding near poles
-    at 1. Sign changes of Im L at a pole on the unit circle, where L is infinite, are ignored as well.
+    Crossings that need a gain change of more than `LARGEST_MARGIN` are ignored. They result from rounding errors near
+    poles at 1. Sign changes of Im L at a pole on the unit circle, where L is infinite, are ignored as well.
     """
     real, imag = L.real, L.imag
     fraction = imag[:-1] / jnp.where(imag[:-1] == imag[1:], 1.0, imag[:-1] - imag[1:])
     crossing = real[:-1] + fraction * (real[1:] - real[:-1])
-    limit = 10.0 ** (MOST / 20.0)
-    there = (imag[:-1] * imag[1:] < 0.0) & (crossing < -1.0 / limit) & (crossing > -limit) & ~_through_infinity(L)
-    return there, -jnp.log(jnp.where(there, -crossing, 1.0))
+    limit = 10.0 ** (LARGEST_MARGIN / 20.0)
+    crosses = (imag[:-1] * imag[1:] < 0.0) & (crossing < -1.0 / limit) & (crossing > -limit) & ~_has_pole_on_circle(L)
+    return crosses, -jnp.log(jnp.where(crosses, -crossing, 1.0))
 
 
-def _through_infinity(L: Array) -> Array:
+def _has_pole_on_circle(L: Array) -> Array:
     """Return which intervals have a pole on the unit circle, (points - 1,) bool.
 
     There |L| grows toward the interval from both sides, and the phase of L jumps by more than 90 deg.
     """
     size = jnp.abs(L)
-    grows, falls = size[1:-1] >= (1.0 - EVEN) * size[:-2], size[1:-1] >= (1.0 - EVEN) * size[2:]
-    back = (L[1:] * jnp.conj(L[:-1])).real < 0.0
-    return back & jnp.append(True, grows) & jnp.append(falls, True)
+    grows, falls = size[1:-1] >= (1.0 - EQUAL_TOLERANCE) * size[:-2], size[1:-1] >= (1.0 - EQUAL_TOLERANCE) * size[2:]
+    jumps = (L[1:] * jnp.conj(L[:-1])).real < 0.0
+    return jumps & jnp.append(True, grows) & jnp.append(falls, True)
 
 
-def unit_gain_at(L: Array) -> tuple[Array, Array]:
+def unit_gain_crossings(L: Array) -> tuple[Array, Array]:
     """Return which intervals have a crossing of |L| = 1, and the angle from -1 to L there, in (-pi, pi] [rad]."""
-    there, fraction = _unit_gain_crossings(L)
-    turned = jnp.angle(L[1:] / L[:-1])
-    return there, jnp.angle(-L[:-1] * jnp.exp(1j * fraction * turned))
+    crosses, fraction = _interpolate_unit_gain(L)
+    phase_step = jnp.angle(L[1:] / L[:-1])
+    return crosses, jnp.angle(-L[:-1] * jnp.exp(1j * fraction * phase_step))
 
 
-def _unit_gain_crossings(L: Array) -> tuple[Array, Array]:
+def _interpolate_unit_gain(L: Array) -> tuple[Array, Array]:
     """Return which intervals have a crossing of |L| = 1, and its place as a fraction, by interpolation of ln |L|."""
     size = jnp.log(jnp.abs(L))
-    there = size[:-1] * size[1:] < 0.0
-    return there, size[:-1] / jnp.where(there, size[:-1] - size[1:], 1.0)
+    crosses = size[:-1] * size[1:] < 0.0
+    return crosses, size[:-1] / jnp.where(crosses, size[:-1] - size[1:], 1.0)
 
 
-def delay_at(w: Array, L: Array) -> tuple[Array, Array]:
+def crossing_delays(w: Array, L: Array) -> tuple[Array, Array]:
     """Return delays [s] that rotate L to -1 if |L| crosses 1 in an interval, else infinity, (points - 1,).
 
     The second result is the frequency of each crossing [rad/s].
     """
-    there, left = unit_gain_at(L)
-    at = w[:-1] * (w[1:] / w[:-1]) ** jnp.where(there, _unit_gain_crossings(L)[1], 0.0)
-    return jnp.where(there, jnp.where(left < 0.0, left + 2.0 * jnp.pi, left) / at, jnp.inf), at
+    crosses, angle = unit_gain_crossings(L)
+    frequency = w[:-1] * (w[1:] / w[:-1]) ** jnp.where(crosses, _interpolate_unit_gain(L)[1], 0.0)
+    return jnp.where(crosses, jnp.where(angle < 0.0, angle + 2.0 * jnp.pi, angle) / frequency, jnp.inf), frequency
 
 
-def zeros_of(values: Complex[Array, "rows points"], count: int) -> tuple[Array, Array]:
+def find_zeros(values: Complex[Array, "rows points"], count: int) -> tuple[Array, Array]:
     """Return approximate zeros of an analytic function on a grid: fractional row and point, (count,) each.
 
     The search applies the argument principle to every cell of the grid. A cell contains a zero if the values at its
@@ -269,31 +271,31 @@ def zeros_of(values: Complex[Array, "rows points"], count: int) -> tuple[Array, 
     x, y = values.real, values.imag.at[:, -1].set(0.0)
     above = (y >= 0.0).astype(int)
 
-    def crossed(begin: tuple, end: tuple) -> Array:
+    def count_crossing(begin: tuple, end: tuple) -> Array:
         """Return 1 (-1) if the line between two points crosses the negative real axis from above (below), else 0."""
-        way = above[begin] - above[end]
-        return jnp.where(way * (x[begin] * y[end] - x[end] * y[begin]) > 0.0, way, 0)
+        direction = above[begin] - above[end]
+        return jnp.where(direction * (x[begin] * y[end] - x[end] * y[begin]) > 0.0, direction, 0)
 
     every, first, later = slice(None), slice(None, -1), slice(1, None)
-    by_points, by_rows = crossed((every, first), (every, later)), crossed((first, every), (later, every))
-    turns = by_points[:-1] + by_rows[:, 1:] - by_points[1:] - by_rows[:, :-1]
-    inside = jnp.append(turns != 0, x[:-1, -1:] * x[1:, -1:] < 0.0, axis=1)
+    by_points, by_rows = count_crossing((every, first), (every, later)), count_crossing((first, every), (later, every))
+    winding = by_points[:-1] + by_rows[:, 1:] - by_points[1:] - by_rows[:, :-1]
+    inside = jnp.append(winding != 0, x[:-1, -1:] * x[1:, -1:] < 0.0, axis=1)
     rows, places = smallest_values(jnp.where(inside, jnp.arange(len(inside))[:, None], jnp.inf).reshape(-1), count)
     row, point = jnp.divmod(places, values.shape[1])
     last = point == values.shape[1] - 1
     # linear interpolation from three corners of the cell
-    here = values[row, point]
-    to_row, to_point = values[row + 1, point] - here, jnp.where(last, 1j, values[row, point + 1] - here)
+    corner = values[row, point]
+    to_row, to_point = values[row + 1, point] - corner, jnp.where(last, 1j, values[row, point + 1] - corner)
     area = (jnp.conj(to_point) * to_row).imag
     area = jnp.where(area == 0.0, 1.0, area)
-    by_row = -(jnp.conj(to_point) * here).imag / area
-    by_point = jnp.where(last, 0.0, (jnp.conj(to_row) * here).imag / area)
+    by_row = -(jnp.conj(to_point) * corner).imag / area
+    by_point = jnp.where(last, 0.0, (jnp.conj(to_row) * corner).imag / area)
     return rows + by_row.clip(0.0, 1.0), point + by_point.clip(0.0, 1.0)
 
 
-def ends_at(ends: Array) -> Array:
+def is_real_at_ends(ends: Array) -> Array:
     """Return whether L [-] is real at each end of the grid, bool. A gain can then move a pole to 1 or to -1."""
-    return jnp.abs(ends.imag) < REAL * jnp.abs(ends.real)
+    return jnp.abs(ends.imag) < REAL_TOLERANCE * jnp.abs(ends.real)
 
 
 def margins_on_grid(L: Complex[Array, " points"]) -> tuple[Array, Array, Array]:
@@ -301,18 +303,18 @@ def margins_on_grid(L: Complex[Array, " points"]) -> tuple[Array, Array, Array]:
 
     The function interpolates between grid points: crossings in ln L, the distance to -1 along straight lines.
     """
-    there, _ = real_at(L)
+    crosses, _ = real_axis_crossings(L)
     size, angle = jnp.log(jnp.abs(L)), jnp.angle(-L)
-    apart = angle[:-1] - angle[1:]
-    factor = -size[:-1] + angle[:-1] / jnp.where(there, apart, 1.0) * (size[:-1] - size[1:])
+    phase_step = angle[:-1] - angle[1:]
+    factor = -size[:-1] + angle[:-1] / jnp.where(crosses, phase_step, 1.0) * (size[:-1] - size[1:])
     ends = L[jnp.array([0, -1])]
-    real = ends_at(ends) & (ends.real < 0.0)
+    real = is_real_at_ends(ends) & (ends.real < 0.0)
     factors = jnp.append(factor, -jnp.log(jnp.where(real, -ends.real, 1.0)))
-    gain = jnp.min(jnp.where(jnp.append(there, real) & (factors != 0.0), jnp.abs(factors), jnp.inf))
-    even, left = unit_gain_at(L)
-    phase = jnp.min(jnp.where(even, jnp.abs(left), jnp.pi))
+    gain = jnp.min(jnp.where(jnp.append(crosses, real) & (factors != 0.0), jnp.abs(factors), jnp.inf))
+    unit_gain, angle_from_minus_one = unit_gain_crossings(L)
+    phase = jnp.min(jnp.where(unit_gain, jnp.abs(angle_from_minus_one), jnp.pi))
     step = L[1:] - L[:-1]
     size = jnp.maximum(jnp.abs(step) ** 2, 1e-300)
-    along = jnp.clip(-(jnp.conj(step) * (1.0 + L[:-1])).real / size, 0.0, 1.0)
-    near = jnp.min(jnp.abs(1.0 + L[:-1] + along * step))
-    return 20.0 / np.log(10.0) * gain, jnp.rad2deg(phase), -20.0 * jnp.log10(near)
+    fraction = jnp.clip(-(jnp.conj(step) * (1.0 + L[:-1])).real / size, 0.0, 1.0)
+    nearest = jnp.min(jnp.abs(1.0 + L[:-1] + fraction * step))
+    return 20.0 / np.log(10.0) * gain, jnp.rad2deg(phase), -20.0 * jnp.log10(nearest)

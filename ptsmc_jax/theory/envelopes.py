@@ -15,8 +15,8 @@ from ptsmc_jax import programs
 from ptsmc_jax.numerics.pytrees import Scalar
 from ptsmc_jax.simulation.rollout import Parts
 from ptsmc_jax.theory import rates
-from ptsmc_jax.theory.exact_motion import exact
-from ptsmc_jax.theory.solutions import starts, state_envelope, visited
+from ptsmc_jax.theory.exact_motion import exact_error_and_s
+from ptsmc_jax.theory.solutions import initial_errors, state_envelope, visited_states
 
 Vector = Float[Array, " n"]
 
@@ -31,7 +31,7 @@ def sliding_envelope(parts: Parts) -> tuple[float, float]:
     c is 0 for the discontinuous sign, which gives (15), (32) and (43) of the paper.
     """
     law, n = parts.controller, parts.controller.order
-    beta = switching_rate(parts) * parts.plant.inputs * TANH_LOSS * float(law.layer(jnp.asarray(False)))
+    beta = switching_rate(parts) * parts.plant.inputs * TANH_LOSS * float(law.layer_width(jnp.asarray(False)))
     s0 = math.hypot(*np.ravel(_s_at_start(parts)))  # finite even if its square overflows
     return s0, 2.0 * beta / (2.0 * float(law.eta) + n - 4.0)
 
@@ -39,7 +39,7 @@ def sliding_envelope(parts: Parts) -> tuple[float, float]:
 @programs.jit
 def _s_at_start(parts: Parts) -> Array:
     """Return s at t = 0, (m,)."""
-    return exact(parts.controller, jnp.zeros_like(parts.t_end), starts(parts))[1]
+    return exact_error_and_s(parts.controller, jnp.zeros_like(parts.t_end), initial_errors(parts))[1]
 
 
 def switching_rate(parts: Parts) -> float:
@@ -51,11 +51,12 @@ def switching_rate(parts: Parts) -> float:
 def _switching_rates(parts: Parts) -> tuple[Scalar, Scalar]:
     """Return the factor of `switching_rate` for the largest K2, and for the K2 of a settled observer (at t_end)."""
     law, bound = parts.controller, parts.observer.error_bound()
-    seen = visited(parts) if parts.plant.custom_functions else None
-    return rates.switching_rate(law, bound.largest, seen), rates.switching_rate(law, bound(parts.t_end), seen)
+    run_states = visited_states(parts) if parts.plant.custom_functions else None
+    largest, settled = (rates.switching_rate(law, k2, run_states) for k2 in (bound.largest, bound(parts.t_end)))
+    return largest, settled
 
 
-def narrowest_sign(parts: Parts, period: float) -> float:
+def smallest_sign_width(parts: Parts, period: float) -> float:
     """Return the boundary layer thickness below which the sampled s overshoots, in the units of s in the hold phase.
 
     The switching term alone gives s' = -c tanh(s / width), with c = tau^(n-1) times `switching_rate`, held for a period
@@ -97,5 +98,5 @@ def _error_bound(parts: Parts, t: Array, s0: Scalar, residual: Scalar) -> Array:
         centre, half = state_envelope(time, law.t_f, law.eta, x0, s0, residual)
         return jnp.abs(centre[0]) + half[0]
 
-    sizes = jax.vmap(lambda time: jax.vmap(lambda x0: component(time, x0))(starts(parts)))(t)
+    sizes = jax.vmap(lambda time: jax.vmap(lambda x0: component(time, x0))(initial_errors(parts)))(t)
     return jnp.sqrt(jnp.sum(sizes**2, axis=1))

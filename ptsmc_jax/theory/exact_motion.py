@@ -1,7 +1,7 @@
 """Exact motion of a prescribed-time law before the hand-over, and the motion of the plant for a given error.
 
-Read `exact` (error and s) first, then `exact_motion` (state of the plant). "Exact" means without sampling, noise and
-switching.
+"Exact" means without sampling, noise and switching. Read `exact_error_and_s` first, then `exact_motion` (state of the
+plant).
 """
 
 import functools
@@ -30,7 +30,7 @@ class Motion(NamedTuple):
     singularity_distance: Array  # distance to the singularity, positive until the motion reaches the singularity
 
 
-def exact(law: PrescribedTimeLaw, t: Scalar, start: Float[Array, "m n"]) -> tuple[Vector, Vector]:
+def exact_error_and_s(law: PrescribedTimeLaw, t: Scalar, start: Float[Array, "m n"]) -> tuple[Vector, Vector]:
     """Return the error and s, (m,) each, of the exact motion at time t [s] in the approach phase.
 
     Args:
@@ -41,12 +41,12 @@ def exact(law: PrescribedTimeLaw, t: Scalar, start: Float[Array, "m n"]) -> tupl
     if isinstance(law, PrescribedTimeChain):
         chain = exact_chain(t, law.t_f, law.eta, start[0])
         return chain.x[:1], jnp.reshape(chain.s, 1)
-    found = exact_error(t, law.t_f, law.eta, start[:, 0], start[:, 1])
-    return found.error, found.s
+    motion = exact_error(t, law.t_f, law.eta, start[:, 0], start[:, 1])
+    return motion.error, motion.s
 
 
 def exact_motion(law: PrescribedTimeLaw, t: Scalar, target: Any, start: Any, errors: Float[Array, "m n"]) -> Motion:
-    """Return the motion of the plant that has the error of `exact`.
+    """Return the motion of the plant that has the error of `exact_error_and_s`.
 
     Args:
         law: the prescribed-time law.
@@ -58,8 +58,8 @@ def exact_motion(law: PrescribedTimeLaw, t: Scalar, target: Any, start: Any, err
     if isinstance(law, PrescribedTimeChain):  # nowhere singular
         chain = exact_chain(t, law.t_f, law.eta, errors[0])
         return Motion(chain.x, jnp.reshape(chain.acceleration, 1), jnp.ones_like(t))
-    found = exact_error(t, law.t_f, law.eta, errors[:, 0], errors[:, 1])
-    return plant_motion(law.kinematics, target, start, (found.error, found.error_rate, found.acceleration))
+    motion = exact_error(t, law.t_f, law.eta, errors[:, 0], errors[:, 1])
+    return plant_motion(law.kinematics, target, start, (motion.error, motion.error_rate, motion.acceleration))
 
 
 @functools.singledispatch
@@ -109,9 +109,9 @@ def _(kinematics: SecondOrderKinematics, target: Any, start: Any, errors: Errors
     model, n = kinematics.model, kinematics.model.inputs
 
     def newton(_: Any, x: State) -> State:
-        off = model.position_rate(target, x) - error_rate
-        return jnp.concatenate([error, x[n : 2 * n] - matrices.solve(model.slope(target, x), off)])
+        residual = model.position_rate(target, x) - error_rate
+        return jnp.concatenate([error, x[n : 2 * n] - matrices.solve(model.rate_jacobian(target, x), residual)])
 
     x = jax.lax.fori_loop(0, 8, newton, jnp.concatenate([error, start[n : 2 * n]]))
-    w_dot = matrices.solve(model.slope(target, x), acceleration - model.coasting_acceleration(target, x))
+    w_dot = matrices.solve(model.rate_jacobian(target, x), acceleration - model.coasting_acceleration(target, x))
     return Motion(x, w_dot, kinematics.singularity_distance(x, target))

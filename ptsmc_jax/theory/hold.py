@@ -39,7 +39,7 @@ def hold_matrix(surface: Float[Array, " roots"], rate: Scalar) -> Float[Array, "
     return jnp.eye(n, k=1).at[-1].set(last)
 
 
-def exact_hold(after: Scalar, surface: Float[Array, " roots"], rate: Scalar, x: Vector) -> ChainMotion:
+def exact_hold(elapsed: Scalar, surface: Float[Array, " roots"], rate: Scalar, x: Vector) -> ChainMotion:
     """Return the motion of one component of the error in the hold phase, x(t) = e^(A t) x(0) with A of `hold_matrix`.
 
     The eigenvalues of A may repeat. For order 2, with c = `surface_rate` and k = K1/2 of a spacecraft:
@@ -48,7 +48,7 @@ def exact_hold(after: Scalar, surface: Float[Array, " roots"], rate: Scalar, x: 
         x(t) = e^(-c t) x(0) + s(0) (e^(-k t) - e^(-c t)) / (c - k),  or with s(0) t e^(-c t) as last term if k = c
 
     Args:
-        after: time t since the hand-over [s].
+        elapsed: time t since the hand-over [s].
         surface: a_1 .. a_(n-1) [1/s^(n-i)], see `hold_matrix`.
         rate: decay rate of s [1/s], see `hold_matrix`.
         x: the error and its derivatives at the hand-over, (n,), in the states' own units.
@@ -60,7 +60,7 @@ def exact_hold(after: Scalar, surface: Float[Array, " roots"], rate: Scalar, x: 
     '0.735759'
     """
     matrix = hold_matrix(surface, rate)
-    now = integrators.phi_functions(matrix * after, 0)[0] @ x
+    now = integrators.phi_functions(matrix * elapsed, 0)[0] @ x
     return ChainMotion(now, jnp.append(surface, 1.0) @ now, matrix[-1] @ now)
 
 
@@ -75,9 +75,9 @@ def sliding_bound(parts: Parts, t: ArrayLike) -> np.ndarray:
     The bound on |s_i(t_s)| follows from `solutions.state_envelope`. Equations (23) and (51) are the special case
     beta = 0, the discontinuous sign.
     """
-    law, (_, _, s, limit) = parts.controller, _at_hand_over(parts)
-    fallen = np.exp(-2.0 * float(law.reaching_rate) * (np.asarray(t) - float(law.hand_over)))[:, None]
-    return np.sqrt(np.sum(np.asarray(s) ** 2 * fallen + float(limit) ** 2 * (1.0 - fallen), axis=1))
+    law, (_, _, s, limit) = parts.controller, _hand_over_bounds(parts)
+    decay = np.exp(-2.0 * float(law.reaching_rate) * (np.asarray(t) - float(law.hand_over)))[:, None]
+    return np.sqrt(np.sum(np.asarray(s) ** 2 * decay + float(limit) ** 2 * (1.0 - decay), axis=1))
 
 
 def error_bound(parts: Parts, t: ArrayLike) -> np.ndarray:
@@ -87,9 +87,9 @@ def error_bound(parts: Parts, t: ArrayLike) -> np.ndarray:
     lags to its initial state and to s. The poles of the lags are the roots p_i of the surface (39). Lags with the poles
     Re p_i, driven by the bound |s(t_s)| e^(-k t) + (beta/k)^(1/2) of `sliding_bound`, bound the response to s.
     """
-    known = _at_hand_over(parts)
+    hand_over = _hand_over_bounds(parts)
     lags = np.poly(np.real(surface_roots(parts.controller.surface())))[1:][::-1]
-    return np.asarray(_error_bound(parts, known, jnp.asarray(lags), jnp.asarray(t)))
+    return np.asarray(_error_bound(parts, hand_over, jnp.asarray(lags), jnp.asarray(t)))
 
 
 class _HandOver(NamedTuple):
@@ -101,7 +101,7 @@ class _HandOver(NamedTuple):
     limit: Array  # Limit of the bound on |s_i| for t -> infinity, (beta/k)^(1/2).
 
 
-def _at_hand_over(parts: Parts) -> _HandOver:
+def _hand_over_bounds(parts: Parts) -> _HandOver:
     law = parts.controller
     beta = envelopes.switching_rate(parts) * envelopes.TANH_LOSS * float(law.sign_width)
     limit = np.sqrt(beta / float(law.reaching_rate))
@@ -115,22 +115,25 @@ def _bounds_at_hand_over(parts: Parts, s0: Scalar, residual_before: Scalar, limi
     def component(x0: Vector) -> tuple[Vector, Vector]:
         return solutions.state_envelope(law.hand_over, law.t_f, law.eta, x0, s0, residual_before)
 
-    centre, half = jax.vmap(component)(solutions.starts(parts))
+    centre, half = jax.vmap(component)(solutions.initial_errors(parts))
     weights = jnp.append(law.surface(), 1.0)
     return _HandOver(centre, half, jnp.abs(centre @ weights) + half @ jnp.abs(weights), limit)
 
 
 @programs.jit
-def _error_bound(parts: Parts, known: _HandOver, lags: Vector, t: Array) -> Array:
+def _error_bound(parts: Parts, hand_over: _HandOver, lags: Vector, t: Array) -> Array:
     law, n = parts.controller, parts.controller.order
     surface, rate = law.surface(), law.reaching_rate
     on_surface = jnp.eye(n, n - 1).at[-1].set(-surface)  # basis (columns) of the states with s = 0
     off_surface = jnp.eye(n)[-1]  # the state with s = 1 and all other states 0
 
-    def size(after: Scalar) -> Scalar:
-        slid = integrators.phi_functions(hold_matrix(surface, rate) * after, 0)[0][0] @ on_surface
-        falling, staying = (exact_hold(after, lags, k, off_surface).x[0] for k in (rate, jnp.zeros_like(rate)))
-        each = jnp.abs(known.centre[:, :-1] @ slid) + known.half[:, :-1] @ jnp.abs(slid)
-        return guards.norm(each + known.s * falling + known.limit * staying)
+    def bound_at(elapsed: Scalar) -> Scalar:
+        surface_response = integrators.phi_functions(hold_matrix(surface, rate) * elapsed, 0)[0][0] @ on_surface
+        decaying_response, constant_response = (
+            exact_hold(elapsed, lags, k, off_surface).x[0] for k in (rate, jnp.zeros_like(rate))
+        )
+        centre, half = hand_over.centre[:, :-1], hand_over.half[:, :-1]
+        free_bound = jnp.abs(centre @ surface_response) + half @ jnp.abs(surface_response)
+        return guards.norm(free_bound + hand_over.s * decaying_response + hand_over.limit * constant_response)
 
-    return jax.vmap(size)(t - law.hand_over)
+    return jax.vmap(bound_at)(t - law.hand_over)

@@ -27,11 +27,12 @@ from ptsmc_jax.batching import lapack
 from ptsmc_jax.simulation import computer
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.theory import linear
-from ptsmc_jax.theory.crossings import MOST
+from ptsmc_jax.theory.crossings import LARGEST_MARGIN
 
-FEWEST = 16  # Smallest number of full hold periods for a decision.
-TURNS, SLOWEST = 4, 40  # Smallest number of reversals of the command, and largest number of samples between them.
-STAYS = 0.75  # Smallest ratio of the command's variation in the second half of the examined periods to the first half.
+FEWEST_PERIODS = 16  # Smallest number of full hold periods for a decision.
+FEWEST_REVERSALS = 4  # Smallest number of reversals of the command.
+SLOWEST = 40  # Largest mean number of samples between two reversals.
+SUSTAINED = 0.75  # Smallest ratio of the command's variation in the second half of the examined periods to the first.
 NONLINEAR = 0.1  # Smallest nonlinear fraction of a limit cycle: residual relative to the change of the command.
 ROUNDING = 1e-8  # Rounding error, relative to the largest command.
 
@@ -43,7 +44,7 @@ class History(NamedTuple):
     in_hold: Array  # (periods,) bool: full periods in the hold phase
 
 
-def history(parts: Parts, run: linear.Nominal) -> History:
+def command_history(parts: Parts, run: linear.NominalRun) -> History:
     """Return the commands [N m] of a nominal run."""
     return History(run.command, linear.is_full(run.period.now, parts.period) & run.period.now.hold)
 
@@ -55,7 +56,7 @@ class LimitCycle(NamedTuple):
     periods: float  # period of the limit cycle in control periods
 
 
-def find(parts: Parts, seen: History | None = None) -> LimitCycle | None:
+def find(parts: Parts, commands: History | None = None) -> LimitCycle | None:
     """Return the limit cycle of the nominal run in the hold phase, or None.
 
     The result is None if the run converges or oscillates linearly. It is also None for a law with a discontinuous sign,
@@ -63,67 +64,68 @@ def find(parts: Parts, seen: History | None = None) -> LimitCycle | None:
 
     Args:
         parts: the sampled scenario.
-        seen: commands of the nominal run, if known. The nominal run is then only simulated if the command oscillates.
+        commands: commands of the nominal run, or None to simulate it. If they are given, this function simulates the
+            nominal run only if the command oscillates.
     """
     if not np.all(np.asarray(getattr(parts.controller, "sign_width", 1.0))):
         return None
     run = None
-    if seen is None:
-        run = linear.nominal_jit(parts)
-        seen = history(parts, run)
-    u, in_hold = map(np.asarray, seen)
-    whole = np.flatnonzero(in_hold)
-    last = whole[whole.size // 2 :]
-    if whole.size < FEWEST or not np.isfinite(u[last]).all():
+    if commands is None:
+        run = linear.simulate_nominal_jit(parts)
+        commands = command_history(parts, run)
+    u, in_hold = map(np.asarray, commands)
+    hold_periods = np.flatnonzero(in_hold)
+    examined = hold_periods[hold_periods.size // 2 :]
+    if hold_periods.size < FEWEST_PERIODS or not np.isfinite(u[examined]).all():
         return None
-    turns = _oscillates(np.diff(u[last], axis=0), ROUNDING * np.abs(u).max())
-    suspect = turns & _stays(u[last])
+    oscillating = _is_oscillating(np.diff(u[examined], axis=0), ROUNDING * np.abs(u).max())
+    suspect = oscillating & _is_sustained(u[examined])
     if not suspect.any():
         return None
-    run = linear.nominal_jit(parts) if run is None else run
-    off, size = (np.asarray(v)[last] for v in _nonlinear_residual(parts, run))
-    suspect &= _oscillates(off, NONLINEAR * np.abs(off).max(axis=0))
-    suspect &= np.ptp(off, axis=0) > NONLINEAR * np.ptp(size, axis=0)
+    run = linear.simulate_nominal_jit(parts) if run is None else run
+    residual, change = (np.asarray(v)[examined] for v in _nonlinear_residual(parts, run))
+    suspect &= _is_oscillating(residual, NONLINEAR * np.abs(residual).max(axis=0))
+    suspect &= np.ptp(residual, axis=0) > NONLINEAR * np.ptp(change, axis=0)
     if not suspect.any():
         return None
-    return max(_measured(u[last, axis], off[:, axis]) for axis in np.flatnonzero(suspect))
+    return max(_measure_cycle(u[examined, axis], residual[:, axis]) for axis in np.flatnonzero(suspect))
 
 
-def _measured(u: np.ndarray, off: np.ndarray) -> LimitCycle:
+def _measure_cycle(u: np.ndarray, residual: np.ndarray) -> LimitCycle:
     """Return the limit cycle of one axis.
 
     The amplitude is the median over windows of one cycle, so that slower motions contribute little.
 
     Args:
         u: commands of the axis (times,) [N m].
-        off: part of the commands that the linearisation does not explain (times,) [N m].
+        residual: part of the commands that the linearisation does not explain (times,) [N m].
     """
-    periods = 2.0 * (off.size - 1) / float(np.count_nonzero(_reversals(off, 0.0)))
-    turns = np.lib.stride_tricks.sliding_window_view(u, int(np.ceil(periods)))
-    return LimitCycle(float(np.median(np.ptp(turns, axis=1))), periods)
+    periods = 2.0 * (residual.size - 1) / float(np.count_nonzero(_reversals(residual, 0.0)))
+    cycles = np.lib.stride_tricks.sliding_window_view(u, int(np.ceil(periods)))
+    return LimitCycle(float(np.median(np.ptp(cycles, axis=1))), periods)
 
 
-def _reversals(values: np.ndarray, least: Any) -> np.ndarray:
-    """Return the sign changes of values (times,), ignoring values of at most `least` in size."""
-    signs = np.sign(values[np.abs(values) > least])
+def _reversals(values: np.ndarray, threshold: Any) -> np.ndarray:
+    """Return the sign changes of values (times,), ignoring values of at most `threshold` in size."""
+    signs = np.sign(values[np.abs(values) > threshold])
     return signs[1:] != signs[:-1]
 
 
-def _oscillates(values: np.ndarray, least: Any) -> np.ndarray:
+def _is_oscillating(values: np.ndarray, threshold: Any) -> np.ndarray:
     """Return which columns of values (times, m) change their sign often enough to be a limit cycle, (m,) bool."""
-    least = np.broadcast_to(least, values.shape[1])
-    turns = [np.count_nonzero(_reversals(v, low)) for v, low in zip(values.T, least, strict=True)]
-    return np.asarray(turns) >= max(TURNS, values.shape[0] / SLOWEST)
+    threshold = np.broadcast_to(threshold, values.shape[1])
+    reversals = [np.count_nonzero(_reversals(v, low)) for v, low in zip(values.T, threshold, strict=True)]
+    return np.asarray(reversals) >= max(FEWEST_REVERSALS, values.shape[0] / SLOWEST)
 
 
-def _stays(u: np.ndarray) -> np.ndarray:
+def _is_sustained(u: np.ndarray) -> np.ndarray:
     """Return which commands (times, m) vary nearly as much in the second half as in the first, (m,)."""
     first, second = np.array_split(np.diff(u, axis=0), 2)
-    return np.linalg.norm(second, axis=0) >= STAYS * np.linalg.norm(first, axis=0)
+    return np.linalg.norm(second, axis=0) >= SUSTAINED * np.linalg.norm(first, axis=0)
 
 
-@programs.jit(compiler_options=programs.QUICKLY)
-def _nonlinear_residual(parts: Parts, run: linear.Nominal) -> tuple[Array, Array]:
+@programs.jit(compiler_options=programs.FAST_COMPILE)
+def _nonlinear_residual(parts: Parts, run: linear.NominalRun) -> tuple[Array, Array]:
     """Return the nonlinear residual of the command, see the module docstring, and u(x_0) - u(x), (periods, m) each."""
     parts = linear.quiet(parts)
     k2, kinematics, model = parts.observer.error_bound(), parts.controller.kinematics, parts.observer.model
@@ -142,14 +144,14 @@ def _nonlinear_residual(parts: Parts, run: linear.Nominal) -> tuple[Array, Array
         zero = jnp.zeros(model.local_coordinates(seen, seen).size)
         # LAPACK, because `matrices.solve` of six equations takes longer to compile than everything else here
         to_zero_error = -jnp.linalg.solve(jax.jacfwd(error_derivatives)(zero), error_derivatives(zero))
-        here, linear_change = jax.jvp(command, (zero,), (to_zero_error,))
-        change = command(to_zero_error) - here
+        command_here, linear_change = jax.jvp(command, (zero,), (to_zero_error,))
+        change = command(to_zero_error) - command_here
         return change - linear_change, change
 
     return lapack.vmap(in_period)(run.period, run.carry.computer, run.after.computer.seen)
 
 
-def without_margins(margins: Any, rows: Any) -> Any:
+def zero_margins(margins: Any, rows: Any) -> Any:
     """Set the margins of the marked rows to zero, because of a limit cycle. Negative margins do not change.
 
     Args:
@@ -157,6 +159,7 @@ def without_margins(margins: Any, rows: Any) -> Any:
         rows: which rows to change, bool (times,).
     """
     values = jax.tree.map(np.asarray, margins)
-    lost = np.asarray(rows)[:, None] & values.stable
-    none = dict.fromkeys(values._fields, 0.0) | {"peak_sensitivity": MOST, "stable": False, "crossover": np.nan}
-    return values._replace(**{name: np.where(lost, none[name], getattr(values, name)) for name in values._fields})
+    set_to_zero = np.asarray(rows)[:, None] & values.stable
+    not_zero = {"peak_sensitivity": LARGEST_MARGIN, "stable": False, "crossover": np.nan}
+    new = dict.fromkeys(values._fields, 0.0) | not_zero
+    return values._replace(**{name: np.where(set_to_zero, new[name], getattr(values, name)) for name in new})

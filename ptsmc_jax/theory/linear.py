@@ -7,13 +7,14 @@ flight computer's model of the actuators. One period is
     z' = A z + B x_seen + N u_new + O u_old + E d,    u = C z + D x_seen.
 
 - x_seen is the part of the plant state that sensors see.
-- u_new is the command of `delay` periods ago. It acts from the fraction `part` of the period on.
-- u_old is the command before u_new. It acts until then.
+- u_new is the command of `delay` periods ago. It begins to act after a fraction of the period.
+- u_old is the command before u_new. It acts until u_new begins to act.
 - d is a torque on the plant.
 
 The flight computer predicts the applied torque from u with its model of the actuators. It does not see a gain or a
 delay that the analysis inserts at the plant's input. If a star tracker is slower than the loop, the matrices are means
-over its interval; see also `Sensors.in_step`. Read `nominal`, `opened` and `at_input` first.
+over its interval; see also `Sensors.at_control_samples`. Read `simulate_nominal`, `linearise_period` and
+`open_at_input` first.
 """
 
 from collections.abc import Sequence
@@ -35,7 +36,7 @@ from ptsmc_jax.simulation import clock
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.computer import Computer, Decision, Period, decide
 from ptsmc_jax.simulation.control_period import PeriodMotion, State, Tick, control_period, schedule, start
-from ptsmc_jax.theory.carries import Carry, Local
+from ptsmc_jax.theory.carries import Carry, LocalCoordinates
 
 NODES = 0.5 - 0.5 * np.cos(np.pi * np.arange(13) / 12)  # Chebyshev nodes for delays within a period, in periods.
 _WEIGHTS = np.where(np.isin(np.arange(13), (0, 12)), 0.5, 1.0) * (-1.0) ** np.arange(13)  # Barycentric weights.
@@ -48,8 +49,8 @@ class Loop:
 
     a: Leaf  # (n, n) A, derivative of z' by z
     seen: Leaf  # (n, k) B, derivative of z' by x_seen
-    new: Leaf  # (nodes, n, m) N, derivative of z' by u_new, for `part` at each of NODES; `opened(late=False)`: part 0
-    old: Leaf  # (nodes, n, m) O, derivative of z' by u_old, for the same values of `part`
+    new: Leaf  # (nodes, n, m) N, derivative of z' by u_new, if it acts from each fraction of `NODES` on
+    old: Leaf  # (nodes, n, m) O, derivative of z' by u_old, for the same fractions
     command: Leaf  # (m, n) C, derivative of u by z
     direct: Leaf  # (m, k) D, derivative of u by x_seen
     disturbed: Leaf  # (n, m) E, derivative of z' by d
@@ -64,7 +65,7 @@ class Loop:
         return self.a + xp.pad(self.seen, others), self.command + xp.pad(self.direct, others)
 
 
-class Nominal(NamedTuple):
+class NominalRun(NamedTuple):
     """Nominal run without noise and disturbance; the first axis of all arrays is the control period."""
 
     period: Period
@@ -75,34 +76,40 @@ class Nominal(NamedTuple):
 
 def quiet(parts: Parts) -> Parts:
     """Return the parts without noise, disturbance and timing jitter."""
-    nothing = jax.tree_util.Partial(_nothing, jnp.zeros(parts.plant.inputs))
-    return replace(parts, sensors=parts.sensors.in_step().quiet(), disturbance=nothing, walk_rate=None, jitter=None)
+    no_disturbance = jax.tree_util.Partial(_zero_disturbance, jnp.zeros(parts.plant.inputs))
+    return replace(
+        parts,
+        sensors=parts.sensors.at_control_samples().without_noise(),
+        disturbance=no_disturbance,
+        walk_rate=None,
+        jitter=None,
+    )
 
 
-def _nothing(zero: Array, t: Scalar, x: Any) -> Array:
+def _zero_disturbance(zero: Array, t: Scalar, x: Any) -> Array:
     return zero
 
 
-def nominal(parts: Parts) -> Nominal:
+def simulate_nominal(parts: Parts) -> NominalRun:
     """Simulate the nominal run of sampled parts."""
     assert parts.clock.sampled
     parts = quiet(parts)
     ticks = parts.clock.ticks(parts.controller.t_f, parts.controller.delta)
     x0 = parts.aligned_initial
-    vehicle, first = start(parts, ticks, x0, np.uint32(0), np.uint32(0))
+    vehicle, initial = start(parts, ticks, x0, np.uint32(0), np.uint32(0))
 
-    def step(state: State, tick: Tick) -> tuple[State, Nominal]:
+    def step(state: State, tick: Tick) -> tuple[State, NominalRun]:
         after, record = control_period(vehicle, state, tick)
-        arriving = record.decision.u if state.actuators.queue is None else state.actuators.queue[0]
-        return after, Nominal(vehicle.period(tick), Carry.of(state), Carry.of(after), arriving)
+        acting_command = record.decision.u if state.actuators.queue is None else state.actuators.queue[0]
+        return after, NominalRun(vehicle.period(tick), Carry.from_state(state), Carry.from_state(after), acting_command)
 
-    return stacking.scan(step, first, schedule(ticks))[1]
-
-
-nominal_jit = programs.jit(nominal, compiler_options=programs.QUICKLY)
+    return stacking.scan(step, initial, schedule(ticks))[1]
 
 
-def _computed(
+simulate_nominal_jit = programs.jit(simulate_nominal, compiler_options=programs.FAST_COMPILE)
+
+
+def _run_computer(
     parts: Parts, k2: Any, period: Period, carry: Carry, seen: Any
 ) -> tuple[Decision, Computer, ActuatorState]:
     """Return the decision of the flight software, its memory, and the state of its actuator model.
@@ -116,20 +123,20 @@ def _computed(
     """
     actuators, dt = parts.actuators, period.length
     decision, computer = decide(parts, k2, period, carry.computer, seen)
-    model = carry.model._replace(h=carry.acting.h)
+    model = carry.actuator_model._replace(h=carry.actuators.h)
     drive, queue = actuators.command(
         model, decision.u, decision.w, period.now.t, period.assumed_length, period.now.noise_weight
     )
-    computer = computer._replace(applied=actuators.assumed(drive, dt))
+    computer = computer._replace(applied=actuators.assumed_torque(drive, dt))
     return decision, computer, actuators.end(model, drive, queue, dt)._replace(h=None)
 
 
-def _acted(
+def _apply_commands(
     parts: Parts,
     carry: Carry,
     w: Array,
     commands: Sequence[tuple[Array, Scalar, Scalar]],
-    pushed: Array | None = None,
+    extra_torque: Array | None = None,
 ) -> tuple[Any, ActuatorState]:
     """Return the states of plant and actuators after commands have acted one after the other.
 
@@ -140,25 +147,25 @@ def _acted(
         carry: the loop at the sample.
         w: body rate that the flight computer knows, (m,) [rad/s].
         commands: each command (m,) [N m], the time when it begins to act [s], and how long it acts [s].
-        pushed: additional torque on the plant, (m,) [N m].
+        extra_torque: additional torque on the plant, (m,) [N m].
     """
     actuators = parts.actuators
 
-    def span(state: tuple[Any, ActuatorState], arrived: tuple) -> tuple[tuple[Any, ActuatorState], None]:
-        (x, acting), (command, t, length) = state, arrived
-        due = command if actuators.delay else actuators.send(acting, command, w)[0]
-        drive = actuators.drive(acting, due, t, length)
-        x = PeriodMotion(parts, t, x, drive, pushed).after(length)
-        return (x, actuators.end(acting, drive, None, length)), None
+    def apply_command(state: tuple[Any, ActuatorState], entry: tuple) -> tuple[tuple[Any, ActuatorState], None]:
+        (x, actuator_state), (command, t, length) = state, entry
+        sent = command if actuators.delay else actuators.send(actuator_state, command, w)[0]
+        drive = actuators.drive(actuator_state, sent, t, length)
+        x = PeriodMotion(parts, t, x, drive, extra_torque).state_after(length)
+        return (x, actuators.end(actuator_state, drive, None, length)), None
 
     if len(commands) == 1:
-        return span((carry.x, carry.acting), commands[0])[0]
-    in_turn = jax.tree.map(lambda *v: jnp.stack(v), *commands)  # a loop: the motion is traced and compiled once
-    return jax.lax.scan(span, (carry.x, carry.acting), in_turn)[0]
+        return apply_command((carry.x, carry.actuators), commands[0])[0]
+    stacked = jax.tree.map(lambda *v: jnp.stack(v), *commands)  # a loop: the motion is traced and compiled once
+    return jax.lax.scan(apply_command, (carry.x, carry.actuators), stacked)[0]
 
 
-class Opened(NamedTuple):
-    """Opened loop of a control period of the nominal run, and derivatives of the error and of s."""
+class LinearisedPeriod(NamedTuple):
+    """Linearised and opened loop of one control period, and derivatives of the error and of s at its start."""
 
     loop: Loop
     error: Array  # (m, x) Derivative of the error by the plant's local coordinates.
@@ -167,69 +174,79 @@ class Opened(NamedTuple):
     s_direct: Array  # (components, k) Derivative of s by x_seen.
 
 
-def opened(parts: Parts, during: Nominal, *, late: bool = True) -> Opened:
+def linearise_period(parts: Parts, nominal_period: NominalRun, *, fractional_delays: bool = True) -> LinearisedPeriod:
     """Linearise and open the loop in one control period of the nominal run; see `Loop`, h in [s].
 
     The function does not use the clock of the scenario.
 
     Args:
         parts: the scenario.
-        during: the period of the nominal run.
-        late: whether to compute N and O for commands that begin to act within the period, which is most of the work.
-            `at_input` and `late_axis` need them for delays that are not a whole number of periods.
+        nominal_period: the period of the nominal run.
+        fractional_delays: whether to compute N and O at all `NODES`, which is most of the work. `open_at_input` and
+            `delay_one_axis` need them for delays that are not a whole number of periods. If False, N and O have one
+            node, the fraction 0.
     """
     parts = quiet(parts)
-    period, before, after, arriving = during
-    period = _whole(period)
+    period, before, after, acting_command = nominal_period
+    period = _with_exact_length(period)
     k2, plant, kinematics = parts.observer.error_bound(), parts.plant, parts.controller.kinematics
-    here, there, now, dt = Local(parts, before), Local(parts, after), period.now, period.length
-    z0, x0, known, u0 = (jnp.zeros(n) for n in (sum(here.sizes), *here.sizes[:2], plant.inputs))
+    at_start, at_end = LocalCoordinates(parts, before), LocalCoordinates(parts, after)
+    now, dt = period.now, period.length
+    z0, x0, seen0, u0 = (jnp.zeros(n) for n in (sum(at_start.sizes), *at_start.sizes[:2], plant.inputs))
     target = parts.reference(now.t)
 
-    def simulated(z: Array, seen: Array, new: Array, d: Array) -> tuple[Array, Array, Array]:
-        carry = here.retract(z)
+    def simulate_period(z: Array, seen: Array, new: Array, d: Array) -> tuple[Array, Array, Array]:
+        carry = at_start.retract(z)
         seen = parts.observer.model.retract(plant.visible(before.x), seen)
-        decision, computer, model = _computed(parts, k2, period, carry, seen)
-        x, acting = _acted(parts, carry, decision.w, [(arriving + new, now.t, dt)], d)
+        decision, computer, model = _run_computer(parts, k2, period, carry, seen)
+        x, actuator_state = _apply_commands(parts, carry, decision.w, [(acting_command + new, now.t, dt)], d)
         sent = decision.u
         if parts.actuators.delay:
-            sent, _ = parts.actuators.send(carry.acting, decision.u, decision.w)
-        return there.local_coordinates(Carry(x, acting, computer, model)), sent, decision.s
+            sent, _ = parts.actuators.send(carry.actuators, decision.u, decision.w)
+        return at_end.local_coordinates(Carry(x, actuator_state, computer, model)), sent, decision.s
 
-    def pushed(part: Scalar) -> tuple[Array, Array]:
-        def ended(old: Array, new: Array) -> Array:
-            from_then_on = (arriving + new, now.t + part * dt, (1.0 - part) * dt)
-            commands = [(arriving + old, now.t, part * dt), from_then_on]
-            x, acting = _acted(parts, before, plant.velocity(after.computer.seen), commands)
-            return there.local_coordinates(after._replace(x=x, acting=acting))
+    def command_jacobians(fraction: Scalar) -> tuple[Array, Array]:
+        def simulate_end(old: Array, new: Array) -> Array:
+            new_entry = (acting_command + new, now.t + fraction * dt, (1.0 - fraction) * dt)
+            commands = [(acting_command + old, now.t, fraction * dt), new_entry]
+            x, actuator_state = _apply_commands(parts, before, plant.velocity(after.computer.seen), commands)
+            return at_end.local_coordinates(after._replace(x=x, actuators=actuator_state))
 
-        return jax.jacfwd(ended, argnums=(0, 1))(u0, u0)
+        return jax.jacfwd(simulate_end, argnums=(0, 1))(u0, u0)
 
-    by_all = jax.jacfwd(simulated, argnums=(0, 1, 2, 3))(z0, known, u0, u0)
-    (a, seen, new, disturbed), (command, direct, *_), (s_command, s_direct, *_) = by_all
-    old, new = lapack.vmap(pushed)(jnp.asarray(NODES)) if late else (jnp.zeros_like(new)[None], new[None])
+    jacobians = jax.jacfwd(simulate_period, argnums=(0, 1, 2, 3))(z0, seen0, u0, u0)
+    (a, seen, new, disturbed), (command, direct, *_), (s_command, s_direct, *_) = jacobians
+    if fractional_delays:
+        old, new = lapack.vmap(command_jacobians)(jnp.asarray(NODES))
+    else:
+        old, new = jnp.zeros_like(new)[None], new[None]
     loop = Loop(a, seen, new, old, command, direct, disturbed, dt, delay=parts.actuators.delay)
-    error, error_rate = jax.jacfwd(lambda by: kinematics.errors(plant.retract(before.x, by), target))(x0)
-    return Opened(loop, error, error_rate, s_command, s_direct)
+    error, error_rate = jax.jacfwd(lambda offset: kinematics.errors(plant.retract(before.x, offset), target))(x0)
+    return LinearisedPeriod(loop, error, error_rate, s_command, s_direct)
 
 
-def _whole(period: Period) -> Period:
+def _with_exact_length(period: Period) -> Period:
     """Return the period; a full period gets exactly the length of the clock's period [s], with its derivatives.
 
     Without this, the length of the last full period could have a wrong derivative by delta: its sample depends on
     delta, but its end t_end does not.
     """
     now, length = period.now, period.full_length
-    ends = jnp.where(is_full(now, length), now.t + length, now.t_next)
-    return period._replace(now=now._replace(t_next=ends))
+    end = jnp.where(is_full(now, length), now.t + length, now.t_next)
+    return period._replace(now=now._replace(t_next=end))
 
 
-TOGETHER = 64  # periods that one call of the compiled program linearises
+PERIODS_PER_CALL = 64  # periods that one call of the compiled program linearises
 
 
-def opened_in(
-    parts: Parts, run: Nominal, indices: np.ndarray, widths: np.ndarray | None = None, *, late: bool = True
-) -> Opened:
+def linearise_periods(
+    parts: Parts,
+    run: NominalRun,
+    indices: np.ndarray,
+    widths: np.ndarray | None = None,
+    *,
+    fractional_delays: bool = True,
+) -> LinearisedPeriod:
     """Linearise and open the loop in several periods, h in [s]; the first axis of the result is the period.
 
     The same compiled program is used for any number of periods.
@@ -239,30 +256,35 @@ def opened_in(
         run: the nominal run.
         indices: numbers of the periods (periods,).
         widths: thickness of the law's boundary layer in each period (periods,), or None for the law's `sign_width`.
-        late: see `opened`.
+        fractional_delays: see `linearise_period`.
     """
-    parts = replace(parts, clock=clock.flight(1.0, 1.0))
-    listed = jax.tree.map(lambda v: np.asarray(v)[indices], run), widths
+    parts = replace(parts, clock=clock.flight_clock(1.0, 1.0))
+    selected = jax.tree.map(lambda v: np.asarray(v)[indices], run), widths
 
-    def call(k: int) -> Opened:
-        some = np.resize(np.arange(k, min(k + TOGETHER, len(indices))), TOGETHER)
-        return jax.tree.map(np.asarray, _opened(parts, *jax.tree.map(lambda v: v[some], listed), late=late))
+    def call(k: int) -> LinearisedPeriod:
+        batch = np.resize(np.arange(k, min(k + PERIODS_PER_CALL, len(indices))), PERIODS_PER_CALL)
+        runs_and_widths = jax.tree.map(lambda v: v[batch], selected)
+        result = _linearise_batch(parts, *runs_and_widths, fractional_delays=fractional_delays)
+        return jax.tree.map(np.asarray, result)
 
-    calls = [call(k) for k in range(0, len(indices), TOGETHER)]
-    return jax.tree.map(lambda *many: np.concatenate(many)[: len(indices)], *calls)
-
-
-@programs.jit(static_argnames=("late",), compiler_options=programs.QUICKLY)
-def _opened(parts: Parts, during: Nominal, widths: Array | None, late: bool) -> Opened:
-    def one(during: Nominal, width: Any) -> Opened:
-        if width is None:
-            return opened(parts, during, late=late)
-        return opened(replace(parts, controller=replace(parts.controller, sign_width=width)), during, late=late)
-
-    return lapack.vmap(one)(during, widths)
+    calls = [call(k) for k in range(0, len(indices), PERIODS_PER_CALL)]
+    return jax.tree.map(lambda *blocks: np.concatenate(blocks)[: len(indices)], *calls)
 
 
-def loops_in(parts: Parts, run: Nominal, indices: np.ndarray) -> Loop:
+@programs.jit(static_argnames=("fractional_delays",), compiler_options=programs.FAST_COMPILE)
+def _linearise_batch(
+    parts: Parts, nominal_periods: NominalRun, widths: Array | None, fractional_delays: bool
+) -> LinearisedPeriod:
+    def linearise(nominal_period: NominalRun, width: Any) -> LinearisedPeriod:
+        changed = parts
+        if width is not None:
+            changed = replace(parts, controller=replace(parts.controller, sign_width=width))
+        return linearise_period(changed, nominal_period, fractional_delays=fractional_delays)
+
+    return lapack.vmap(linearise)(nominal_periods, widths)
+
+
+def open_loops(parts: Parts, run: NominalRun, indices: np.ndarray) -> Loop:
     """Return the opened loops of several periods, h in [s]; the first axis of the result is the period.
 
     If a star tracker is slower than the loop, each loop is the mean over the star tracker's interval.
@@ -272,38 +294,38 @@ def loops_in(parts: Parts, run: Nominal, indices: np.ndarray) -> Loop:
         run: the nominal run.
         indices: numbers of the periods (periods,).
     """
-    several = _averaged_periods(parts, indices)
-    return _means(opened_in(parts, run, several.reshape(-1)).loop, several.shape)
+    periods = _periods_to_average(parts, indices)
+    return _average_loops(linearise_periods(parts, run, periods.reshape(-1)).loop, periods.shape)
 
 
-def loops_at(parts: Parts, run: Nominal, indices: Array, *, late: bool = True) -> Loop:
-    """Return the loops of `loops_in`, h in [s], inside a JAX transformation: the indices may be tracers.
+def open_loops_traced(parts: Parts, run: NominalRun, indices: Array, *, fractional_delays: bool = True) -> Loop:
+    """Return the loops of `open_loops`, h in [s], inside a JAX transformation: the indices may be tracers.
 
     Args:
         parts: the scenario.
         run: the nominal run.
         indices: numbers of the periods (periods,).
-        late: see `opened`.
+        fractional_delays: see `linearise_period`.
     """
-    several = _averaged_periods(parts, indices)
+    periods = _periods_to_average(parts, indices)
 
-    def one(index: Array) -> Loop:
-        return opened(parts, jax.tree.map(lambda v: v[index], run), late=late).loop
+    def open_one(index: Array) -> Loop:
+        return linearise_period(parts, jax.tree.map(lambda v: v[index], run), fractional_delays=fractional_delays).loop
 
-    return _means(lapack.vmap(one)(several.reshape(-1)), several.shape)
+    return _average_loops(lapack.vmap(open_one)(periods.reshape(-1)), periods.shape)
 
 
-def averaged(parts: Parts) -> int:
+def averaging_periods(parts: Parts) -> int:
     """Return the number of control periods between star tracker samples, over which a loop is averaged."""
     return getattr(parts.sensors, "every", 1)
 
 
-def _averaged_periods(parts: Parts, indices: Any) -> Any:
+def _periods_to_average(parts: Parts, indices: Any) -> Any:
     """Return the numbers of the periods whose loops are averaged for each index, (indices, every)."""
-    return (indices[:, None] - np.arange(averaged(parts))[None]).clip(0)
+    return (indices[:, None] - np.arange(averaging_periods(parts))[None]).clip(0)
 
 
-def _means(loops: Loop, shape: tuple[int, ...]) -> Loop:
+def _average_loops(loops: Loop, shape: tuple[int, ...]) -> Loop:
     return jax.tree.map(lambda v: v.reshape(*shape, *v.shape[1:]).mean(axis=1), loops)
 
 
@@ -312,7 +334,7 @@ def is_full(ticks: Ticks, period: Any) -> Any:
     return ticks.t_next - ticks.t > (1.0 - 1e-6) * period
 
 
-def full_periods(parts: Parts, run: Nominal, *, hold: bool) -> np.ndarray:
+def full_periods(parts: Parts, run: NominalRun, *, hold: bool) -> np.ndarray:
     """Return the numbers (periods,) of the full control periods before or after the hand-over.
 
     Args:
@@ -326,20 +348,20 @@ def full_periods(parts: Parts, run: Nominal, *, hold: bool) -> np.ndarray:
     return np.flatnonzero(long_enough & (np.asarray(in_hold) == hold))
 
 
-def acting(loop: Loop, part: ArrayLike, xp: Any = jnp) -> tuple[Any, Any]:
+def command_effect(loop: Loop, fraction: ArrayLike, xp: Any = jnp) -> tuple[Any, Any]:
     """Return N and O, (n, m) each, for a command [N m] that begins to act within the period.
 
     The function interpolates by polynomials through `NODES`.
 
     Args:
         loop: the opened loop.
-        part: fraction of the period after which the command acts, 0 to 1.
+        fraction: fraction of the period after which the command acts, 0 to 1.
         xp: `jax.numpy` or `numpy`.
     """
-    gap = part - xp.asarray(NODES)
-    on = xp.abs(gap) < 1e-14
-    weights = xp.asarray(_WEIGHTS) / xp.where(on, 1.0, gap)
-    weights = xp.where(xp.any(on), on.astype(float), weights / xp.sum(weights))
+    offset = fraction - xp.asarray(NODES)
+    at_node = xp.abs(offset) < 1e-14
+    weights = xp.asarray(_WEIGHTS) / xp.where(at_node, 1.0, offset)
+    weights = xp.where(xp.any(at_node), at_node.astype(float), weights / xp.sum(weights))
     return xp.tensordot(weights, loop.new, 1), xp.tensordot(weights, loop.old, 1)
 
 
@@ -358,7 +380,7 @@ class Opening(NamedTuple):
         return self.a + self.b @ (gain * self.c if np.ndim(gain) == 0 else gain @ self.c)
 
 
-def at_input(loop: Loop, extra_delay: float = 0.0, xp: Any = jnp) -> Opening:
+def open_at_input(loop: Loop, extra_delay: float = 0.0, xp: Any = jnp) -> Opening:
     """Return the loop opened at the plant's input, B (n, m), with an additional delay of the command [N m].
 
     Args:
@@ -367,32 +389,32 @@ def at_input(loop: Loop, extra_delay: float = 0.0, xp: Any = jnp) -> Opening:
         xp: `jax.numpy` or `numpy`.
     """
     a, command = loop.closed_at_sensors(xp)
-    (m, n), total = command.shape, loop.delay + extra_delay
-    whole = int(np.floor(total + 1e-12))
-    part = max(total - whole, 0.0)
-    pushes = [xp.zeros((n, m))] * whole + [loop.new[0]]  # entry k: effect of the command of k periods ago
-    if part > 0.0:
-        pushes[whole:] = acting(loop, part, xp)
-    waiting = (len(pushes) - 1) * m  # number of states for delayed commands, newest first
-    coming = xp.concatenate([a, *pushes[1:]], axis=1)
-    moving = xp.concatenate([xp.zeros((waiting, n)), xp.eye(waiting, k=-m)], axis=1)
-    b = xp.concatenate([pushes[0], xp.eye(waiting, m)])
-    return Opening(xp.concatenate([coming, moving]), b, xp.pad(command, ((0, 0), (0, waiting))))
+    (m, n), delay = command.shape, loop.delay + extra_delay
+    whole = int(np.floor(delay + 1e-12))
+    fraction = max(delay - whole, 0.0)
+    effects = [xp.zeros((n, m))] * whole + [loop.new[0]]  # entry k: effect of the command of k periods ago
+    if fraction > 0.0:
+        effects[whole:] = command_effect(loop, fraction, xp)
+    queue_size = (len(effects) - 1) * m  # number of states for delayed commands, newest first
+    state_rows = xp.concatenate([a, *effects[1:]], axis=1)
+    queue_rows = xp.concatenate([xp.zeros((queue_size, n)), xp.eye(queue_size, k=-m)], axis=1)
+    b = xp.concatenate([effects[0], xp.eye(queue_size, m)])
+    return Opening(xp.concatenate([state_rows, queue_rows]), b, xp.pad(command, ((0, 0), (0, queue_size))))
 
 
-def at_sensors(loop: Loop) -> Opening:
+def open_at_sensors(loop: Loop) -> Opening:
     """Return the loop opened at the sensors, B (n, k), with x_seen in rad and rad/s as input."""
     (n, k), (m, _) = loop.seen.shape, loop.command.shape
-    push, waiting = loop.new[0], loop.delay * m
-    if not waiting:
-        return Opening(loop.a + push @ loop.command, loop.seen + push @ loop.direct, jnp.eye(k, n))
-    full = jnp.zeros((n + waiting,) * 2).at[:n, :n].set(loop.a).at[:n, -m:].set(push)
-    full = full.at[n : n + m, :n].set(loop.command).at[n + m :, n : n + waiting - m].set(jnp.eye(waiting - m))
-    b = jnp.zeros((n + waiting, k)).at[:n].set(loop.seen).at[n : n + m].set(loop.direct)
-    return Opening(full, b, jnp.eye(k, n + waiting))
+    effect, queue_size = loop.new[0], loop.delay * m
+    if not queue_size:
+        return Opening(loop.a + effect @ loop.command, loop.seen + effect @ loop.direct, jnp.eye(k, n))
+    a = jnp.zeros((n + queue_size,) * 2).at[:n, :n].set(loop.a).at[:n, -m:].set(effect)
+    a = a.at[n : n + m, :n].set(loop.command).at[n + m :, n : n + queue_size - m].set(jnp.eye(queue_size - m))
+    b = jnp.zeros((n + queue_size, k)).at[:n].set(loop.seen).at[n : n + m].set(loop.direct)
+    return Opening(a, b, jnp.eye(k, n + queue_size))
 
 
-def late_axis(loop: Loop, z: Array, extra_delay: Scalar, axis: Any) -> Opening:
+def delay_one_axis(loop: Loop, z: Array, extra_delay: Scalar, axis: Any) -> Opening:
     """Return the loop opened at the plant's input, B (n, m), with an additional delay of one axis, valid at one z [-].
 
     The loop transfer matrix is z^-`loop.delay` times the L(z) of the result.
@@ -405,12 +427,12 @@ def late_axis(loop: Loop, z: Array, extra_delay: Scalar, axis: Any) -> Opening:
     """
     a, command = loop.closed_at_sensors()
     whole = jnp.floor(extra_delay)
-    new, old = acting(loop, extra_delay - whole)
+    new, old = command_effect(loop, extra_delay - whole)
     delayed = (new + old / z) * z**-whole
     return Opening(a, jnp.where(jnp.arange(command.shape[0]) == axis, delayed, loop.new[0]), command)
 
 
-def radius(loop: Loop, gain: Any = 1.0, extra_delay: float = 0.0) -> float:
+def spectral_radius(loop: Loop, gain: Any = 1.0, extra_delay: float = 0.0) -> float:
     """Return the spectral radius of the closed loop [-].
 
     The loop is stable below 1. Poles of stored wheel momentum are at 1. The result is NaN if the nominal run is not
@@ -422,5 +444,5 @@ def radius(loop: Loop, gain: Any = 1.0, extra_delay: float = 0.0) -> float:
         gain: gain at the plant's input [-], a number or a matrix (m, m).
         extra_delay: additional delay of all axes in periods.
     """
-    closed = at_input(jax.tree.map(np.asarray, loop), extra_delay, np).closed(gain)
+    closed = open_at_input(jax.tree.map(np.asarray, loop), extra_delay, np).closed(gain)
     return float(np.abs(np.linalg.eigvals(closed)).max()) if np.all(np.isfinite(closed)) else float("nan")

@@ -16,8 +16,9 @@ Assumptions:
 - An attitude filter starts with its steady-state covariance, and a gyro bias with its 1 sigma.
 - The torque in a period uses samples up to `delay` periods before its start. The error is predicted from there on.
 
-The bound applies to the mean over trials. A single run, or a small campaign, may be below it by chance. Read `along`
-first.
+The bound applies to the mean over trials. A single run, or a small campaign, may be below it by chance.
+
+Read `bound_along_run` first.
 """
 
 from collections import deque
@@ -32,7 +33,7 @@ from jaxtyping import Array, Float
 
 from ptsmc_jax import programs
 from ptsmc_jax.batching import lapack
-from ptsmc_jax.devices.sensors import Reading
+from ptsmc_jax.devices.sensors import MeasurementModel
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.numerics import integrators, stacking
 from ptsmc_jax.simulation.control_period import PeriodMotion, star_state
@@ -63,41 +64,41 @@ class Model(NamedTuple):
     start: np.ndarray  # (.., n, k) Factor S of the covariance S S' before the first sample.
     rows: np.ndarray  # (m, n) H, or (periods, .., m, n).
     noise: np.ndarray  # (periods, .., m) 1 sigma of each reading; infinite if the reading is not available.
-    kick: np.ndarray  # (periods, .., n, v) B, times the 1 sigma of v.
-    move: np.ndarray  # (periods, .., n, n) F.
+    process_noise: np.ndarray  # (periods, .., n, v) B, times the 1 sigma of v.
+    transition: np.ndarray  # (periods, .., n, n) F.
     output: np.ndarray  # (periods, .., outputs, n) Derivatives of the outputs by z + B v.
 
 
-def along(parts: Parts, log: Log) -> LowerBound:
+def bound_along_run(parts: Parts, log: Log) -> LowerBound:
     """Return the lower bound along a run with this history (`rollout.simulate`, record=True)."""
-    return along_each([(parts, log)])[0]
+    return bounds_along_runs([(parts, log)])[0]
 
 
-def along_each(runs: Sequence[tuple[Parts, Log]]) -> list[LowerBound]:
+def bounds_along_runs(runs: Sequence[tuple[Parts, Log]]) -> list[LowerBound]:
     """Return the lower bound along each of several runs of a scenario; runs with equal shapes are computed together."""
-    lasting = [(parts, *_lasting(parts, log)) for parts, log in runs]
-    alike = dict[tuple, dict[int, Model]]()  # by delay, available samples and shapes
-    for k, (parts, ticks, log) in enumerate(lasting):
-        if parts.clock.sampled and (not parts.sensors.perfect or parts.walk_rate is not None):  # something is unknown
-            model = _model(parts, log, ticks)
+    nonzero = [(parts, *_nonzero_periods(parts, log)) for parts, log in runs]
+    groups = dict[tuple, dict[int, Model]]()  # by delay, available samples and shapes
+    for k, (parts, ticks, log) in enumerate(nonzero):
+        if parts.clock.sampled and (not parts.sensors.perfect or parts.walk_rate is not None):  # else the bound is 0
+            model = _build_model(parts, log, ticks)
             delay = parts.actuators.delay
-            alike.setdefault((delay, np.isfinite(model.noise).tobytes(), *map(np.shape, model)), {})[k] = model
-    squares = [np.zeros((len(ticks.t), 3)) for _, ticks, _ in lasting]
-    for (delay, *_), models in alike.items():
-        sizes = _unknown(_together([*models.values()]), delay)
-        for number, k in enumerate(models):
-            squares[k] = np.sum(sizes[:, number].reshape(len(sizes), 3, -1) ** 2, axis=2)
+            groups.setdefault((delay, np.isfinite(model.noise).tobytes(), *map(np.shape, model)), {})[k] = model
+    squares = [np.zeros((len(ticks.t), 3)) for _, ticks, _ in nonzero]
+    for (delay, *_), models in groups.items():
+        sizes = _significant_deviations(_stack_models([*models.values()]), delay)
+        for place, k in enumerate(models):
+            squares[k] = np.sum(sizes[:, place].reshape(len(sizes), 3, -1) ** 2, axis=2)
     # `squares` are mean squares of the error at the start, in the middle and at the end of each period
     return [
         LowerBound(window_error(parts, ticks, of_run), np.asarray(ticks.t_next), np.sqrt(of_run[:, 2]))
-        for (parts, ticks, _), of_run in zip(lasting, squares, strict=True)
+        for (parts, ticks, _), of_run in zip(nonzero, squares, strict=True)
     ]
 
 
-def _together(models: Sequence[Model]) -> Model:
+def _stack_models(models: Sequence[Model]) -> Model:
     """Stack the models of several runs along an axis of the runs, see `Model`."""
     start, *others = zip(*models, strict=True)
-    return Model(np.stack(start), *(np.stack(some, axis=1) for some in others))
+    return Model(np.stack(start), *(np.stack(arrays, axis=1) for arrays in others))
 
 
 def window_error(parts: Parts, ticks: Ticks, squares: np.ndarray) -> float:
@@ -114,24 +115,24 @@ def window_error(parts: Parts, ticks: Ticks, squares: np.ndarray) -> float:
     return float(np.sqrt(total / float(parts.window)))
 
 
-def pooled(bounds: Iterable[LowerBound]) -> float | None:
+def pool_bounds(bounds: Iterable[LowerBound]) -> float | None:
     """Return the RMS of the bounds of several runs, pooled like window errors, or None without runs."""
-    squares = [one.window_error**2 for one in bounds]
+    squares = [bound.window_error**2 for bound in bounds]
     return float(np.sqrt(np.mean(squares))) if squares else None
 
 
-def _lasting(parts: Parts, log: Log) -> tuple[Any, Any]:
+def _nonzero_periods(parts: Parts, log: Log) -> tuple[Any, Any]:
     """Return the control periods of nonzero length, and the `Log` at their starts and at t_end, as NumPy arrays.
 
     The ticks begin and end at the actual sample times, which may differ from the nominal times.
     """
     ticks = jax.tree.map(np.asarray, _ticks(parts.clock, parts.controller.t_f, parts.controller.delta))
     lengths = ticks.t_next - ticks.t
-    least = 1e-9 * float(np.max(lengths))
-    at_starts = np.append(np.diff(np.asarray(log.t)) > least, True)
-    lasting = jax.tree.map(lambda v: v[lengths > least], ticks)
-    log = jax.tree.map(lambda v: np.asarray(v)[at_starts], log)
-    return lasting._replace(t=log.t[:-1], t_next=log.t[1:]) if parts.clock.sampled else lasting, log
+    shortest = 1e-9 * float(np.max(lengths))
+    kept = np.append(np.diff(np.asarray(log.t)) > shortest, True)
+    nonzero = jax.tree.map(lambda v: v[lengths > shortest], ticks)
+    log = jax.tree.map(lambda v: np.asarray(v)[kept], log)
+    return nonzero._replace(t=log.t[:-1], t_next=log.t[1:]) if parts.clock.sampled else nonzero, log
 
 
 @programs.jit
@@ -139,12 +140,12 @@ def _ticks(clock: Any, t_f: Array, delta: Array) -> Ticks:
     return clock.ticks(t_f, delta)
 
 
-def _unknown(model: Model, delay: int) -> np.ndarray:
-    """Return `deviations`, but 0 for a deviation that results only from the small noise `EXACT` of exact sensors."""
+def _significant_deviations(model: Model, delay: int) -> np.ndarray:
+    """Return `deviations`, but 0 for deviations that result only from the noise `EXACT` assumed for exact sensors."""
     sizes = deviations(model, delay)
     if np.all(model.noise > 0.0):
         return sizes
-    # such deviations are proportional to the assumed noise, and a tenth of it leaves a tenth of them
+    # such deviations are proportional to the assumed noise: a tenth of the noise gives a tenth of the deviation
     return np.where(sizes > 3.0 * deviations(model, delay, EXACT / 10.0), 0.0, sizes)
 
 
@@ -159,26 +160,26 @@ def deviations(model: Model, delay: int = 0, exact: float = EXACT) -> np.ndarray
         delay: delay of the torque in whole periods.
         exact: relative 1 sigma of sensors without noise, see `EXACT`.
     """
-    periods, sizes = len(model.move), np.zeros(model.output.shape[:-1])
-    shape = (*model.move.shape[:-2], *model.rows.shape[-2:])
+    periods, sizes = len(model.transition), np.zeros(model.output.shape[:-1])
+    shape = (*model.transition.shape[:-2], *model.rows.shape[-2:])
     rows, available = np.broadcast_to(model.rows, shape), np.isfinite(model.noise).reshape(periods, -1, shape[-2])
     factor, largest = model.start, np.zeros(shape[1:-1])
-    known = deque([(0, factor)], maxlen=delay + 1)  # period, and covariance factor given the samples up to it
+    factors = deque([(0, factor)], maxlen=delay + 1)  # period, and covariance factor given the samples up to it
 
-    def moved(k: int, factor: np.ndarray) -> np.ndarray:
-        return model.move[k] @ np.concatenate([factor, model.kick[k]], axis=-1)
+    def propagate(k: int, factor: np.ndarray) -> np.ndarray:
+        return model.transition[k] @ np.concatenate([factor, model.process_noise[k]], axis=-1)
 
     for k in range(periods):
-        read, there = rows[k] @ factor, available[k, 0]
-        largest = np.maximum(largest, _sizes(read))
-        noise = np.maximum(model.noise[k], exact * largest)[..., there]
-        factor = _corrected(factor, read[..., there, :], noise[..., None] * np.eye(noise.shape[-1]))
-        known.append((k, factor))
-        period, late = known[0]
+        predicted, is_available = rows[k] @ factor, available[k, 0]
+        largest = np.maximum(largest, _row_norms(predicted))
+        noise = np.maximum(model.noise[k], exact * largest)[..., is_available]
+        factor = _update_factor(factor, predicted[..., is_available, :], noise[..., None] * np.eye(noise.shape[-1]))
+        factors.append((k, factor))
+        period, delayed = factors[0]
         for j in range(period, k):
-            late = _triangular(moved(j, late))
-        sizes[k] = _sizes(model.output[k] @ np.concatenate([late, model.kick[k]], axis=-1))
-        factor = moved(k, factor)
+            delayed = _triangular(propagate(j, delayed))
+        sizes[k] = _row_norms(model.output[k] @ np.concatenate([delayed, model.process_noise[k]], axis=-1))
+        factor = propagate(k, factor)
     return sizes
 
 
@@ -187,7 +188,7 @@ def _triangular(factor: np.ndarray) -> np.ndarray:
     return np.swapaxes(np.linalg.qr(np.swapaxes(factor, -1, -2), mode="r"), -1, -2)
 
 
-def _corrected(factor: np.ndarray, read: np.ndarray, noise: np.ndarray) -> np.ndarray:
+def _update_factor(factor: np.ndarray, read: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """Return a factor (.., n, n) of the covariance after readings.
 
     Args:
@@ -195,79 +196,84 @@ def _corrected(factor: np.ndarray, read: np.ndarray, noise: np.ndarray) -> np.nd
         read: H times the factor, (.., m, k).
         noise: a factor of the covariance of the reading noise, (.., m, m).
     """
-    *many, m, k = read.shape
-    both = np.zeros((*many, m + factor.shape[-2], m + k))
-    both[..., :m, :m], both[..., :m, m:], both[..., m:, m:] = noise, read, factor
-    return _triangular(both)[..., m:, m:]
+    *leading, m, k = read.shape
+    combined = np.zeros((*leading, m + factor.shape[-2], m + k))
+    combined[..., :m, :m], combined[..., :m, m:], combined[..., m:, m:] = noise, read, factor
+    return _triangular(combined)[..., m:, m:]
 
 
-def _sizes(rows: np.ndarray) -> np.ndarray:
+def _row_norms(rows: np.ndarray) -> np.ndarray:
     """Return the 2-norms of the rows."""
     return np.sqrt(np.einsum("...ij,...ij->...i", rows, rows))
 
 
-def _model(parts: Parts, log: Log, ticks: Ticks) -> Model:
+def _build_model(parts: Parts, log: Log, ticks: Ticks) -> Model:
     """Return the linear-Gaussian model of a run.
 
     Its states are the plant's local coordinates, the sensor states (bias), the random-walk torque, and readings that
     were taken but are not used yet.
     """
-    linear: Any = jax.tree.map(np.asarray, _linear(parts, log, ticks))
-    periods, n, m = linear.push.shape
+    jacobians: Any = jax.tree.map(np.asarray, _linearise_run(parts, log, ticks))
+    periods, n, m = jacobians.push.shape
     reading = reading_of(parts.sensors, n, ticks)
-    own, count = reading.own.size, reading.noise.size
-    lag = parts.sensors.lag(ticks) if hasattr(parts.sensors, "lag") else np.zeros((periods, count), int)
+    sensor_states, count = reading.own.size, reading.noise.size
+    lag = (
+        parts.sensors.sample_delays(ticks)
+        if hasattr(parts.sensors, "sample_delays")
+        else np.zeros((periods, count), int)
+    )
     early = np.zeros(count, bool) if reading.early is None else reading.early
-    places = _places(lag, early, n + own + m)
-    size, torque = n + own + m + len(places), slice(n + own, n + own + m)
+    places = _register_places(lag, early, n + sensor_states + m)
+    size, torque = n + sensor_states + m + len(places), slice(n + sensor_states, n + sensor_states + m)
 
-    def wide(rows: np.ndarray) -> np.ndarray:
-        seen = rows.shape[-1] - own  # the flexible modes, which no sensor reads, follow the seen states
+    def widen_rows(rows: np.ndarray) -> np.ndarray:
+        seen = rows.shape[-1] - sensor_states  # the flexible modes, which no sensor reads, follow the seen states
         rows = np.insert(rows, [seen] * (n - seen), 0.0, axis=-1)
         return np.pad(rows, [*[(0, 0)] * (rows.ndim - 1), (0, size - rows.shape[-1])])
 
-    # derivatives by the state at the start of a period: `now` for a reading then, `taken` for one at its actual time
-    now, suite = np.tile(wide(reading.rows), (periods, 1, 1)), linear.now.shape[1] > 0
-    if suite:
-        now[:, :, :n] = linear.now
-    taken = now.copy()
+    # derivatives by the state at the start of a period: `now` of readings at the start, `rows_at_sample` of readings at
+    # their actual sample times
+    now, has_suite = np.tile(widen_rows(reading.rows), (periods, 1, 1)), jacobians.now.shape[1] > 0
+    if has_suite:
+        now[:, :, :n] = jacobians.now
+    rows_at_sample = now.copy()
     if np.any(early):
-        by_seen = np.eye(count) if suite else reading.rows[:, : linear.early.shape[1]]
-        taken[:, early, :n] = by_seen[early] @ linear.early
-        taken[:, early, torque] = by_seen[early] @ linear.early_push
+        by_seen = np.eye(count) if has_suite else reading.rows[:, : jacobians.early.shape[1]]
+        rows_at_sample[:, early, :n] = by_seen[early] @ jacobians.early
+        rows_at_sample[:, early, torque] = by_seen[early] @ jacobians.early_push
 
     # `UNKNOWN` is relative to the 1 sigma of the reading, noise and bias; a state that is read without noise is known
-    off = np.hypot(reading.noise, np.linalg.norm(now[0, :, n : n + own] * reading.own, axis=1))
-    unknown = UNKNOWN * np.max(np.abs(now[0, :, :n]) * off[:, None], axis=0)
-    start = np.diag(np.concatenate([unknown, reading.own, np.zeros(size - n - own)]))
+    reading_sigma = np.hypot(reading.noise, np.linalg.norm(now[0, :, n : n + sensor_states] * reading.own, axis=1))
+    initial_sigma = UNKNOWN * np.max(np.abs(now[0, :, :n]) * reading_sigma[:, None], axis=0)
+    start = np.diag(np.concatenate([initial_sigma, reading.own, np.zeros(size - n - sensor_states)]))
     lengths = np.asarray(ticks.t_next - ticks.t)
     drift = np.diag(np.concatenate([np.zeros(n), reading.own_drift, walk_intensity(parts), np.zeros(len(places))]))
-    move = np.tile(np.eye(size), (periods, 1, 1))
-    move[:, :n, :n], move[:, :n, torque] = linear.move, linear.push
-    output = np.zeros((periods, linear.error.shape[1], size))
-    output[:, :, :n], output[:, :, torque] = linear.error, linear.error_push
+    transition = np.tile(np.eye(size), (periods, 1, 1))
+    transition[:, :n, :n], transition[:, :n, torque] = jacobians.transition, jacobians.push
+    output = np.zeros((periods, jacobians.error.shape[1], size))
+    output[:, :, :n], output[:, :, torque] = jacobians.error, jacobians.error_push
     # a reading that is used at a later sample is stored in extra states, which form a shift register
     rows = now.copy()
-    for (k, number), place in places.items():
-        move[:, place] = taken[:, k] if number == 1 else np.eye(size)[places[k, number - 1]]
-        if number == 1 and early[k]:
+    for (k, stage), place in places.items():
+        transition[:, place] = rows_at_sample[:, k] if stage == 1 else np.eye(size)[places[k, stage - 1]]
+        if stage == 1 and early[k]:
             start[place] = now[0, k] @ start  # the readings of the first sample are taken at the sample itself
-        rows[lag[:, k] + early[k] == number, k] = np.eye(size)[place]
+        rows[lag[:, k] + early[k] == stage, k] = np.eye(size)[place]
     if reading.start is not None:
-        known, factor = reading.start
-        start = _corrected(start, wide(known) @ start, factor)
-    there = np.ones((periods, count), bool) if parts.sensors.perfect else parts.sensors.available(ticks)
+        known_rows, factor = reading.start
+        start = _update_factor(start, widen_rows(known_rows) @ start, factor)
+    available = np.ones((periods, count), bool) if parts.sensors.perfect else parts.sensors.available(ticks)
     return Model(
         start=start,
         rows=rows,
-        noise=np.where(there, reading.noise, np.inf),
-        kick=lengths[:, None, None] * drift[:, n : n + own + m],
-        move=move,
+        noise=np.where(available, reading.noise, np.inf),
+        process_noise=lengths[:, None, None] * drift[:, n : n + sensor_states + m],
+        transition=transition,
         output=output,
     )
 
 
-def _places(lag: np.ndarray, early: np.ndarray, first: int) -> dict[tuple[int, int], int]:
+def _register_places(lag: np.ndarray, early: np.ndarray, first: int) -> dict[tuple[int, int], int]:
     """Return the index of each state that stores a delayed reading, by (reading, position in its shift register).
 
     Args:
@@ -276,12 +282,12 @@ def _places(lag: np.ndarray, early: np.ndarray, first: int) -> dict[tuple[int, i
         early: whether readings are taken between control samples (readings,).
         first: index of the first state that stores a reading.
     """
-    numbers = np.max(lag, axis=0) + early
-    waiting = [(k, number) for k, depth in enumerate(numbers) for number in range(1, depth + 1)]
-    return {one: first + k for k, one in enumerate(waiting)}
+    stages = np.max(lag, axis=0) + early
+    stored = [(k, stage) for k, depth in enumerate(stages) for stage in range(1, depth + 1)]
+    return {reading_and_stage: first + k for k, reading_and_stage in enumerate(stored)}
 
 
-def reading_of(sensors: Any, size: int, ticks: Ticks) -> Reading:
+def reading_of(sensors: Any, size: int, ticks: Ticks) -> MeasurementModel:
     """Return the linear measurement model of the sensors. Perfect sensors read the whole state exactly.
 
     Args:
@@ -290,8 +296,8 @@ def reading_of(sensors: Any, size: int, ticks: Ticks) -> Reading:
         ticks: control periods of nonzero length; the first one gives the initial conditions.
     """
     if sensors.perfect:
-        return Reading(np.eye(size), np.zeros(size), np.zeros(0), np.zeros(0))
-    return sensors.reading(int(ticks.sample[0]), float(ticks.noise_weight[0]))
+        return MeasurementModel(np.eye(size), np.zeros(size), np.zeros(0), np.zeros(0))
+    return sensors.measurement_model(int(ticks.sample[0]), float(ticks.noise_weight[0]))
 
 
 def walk_intensity(parts: Parts) -> np.ndarray:
@@ -302,14 +308,14 @@ def walk_intensity(parts: Parts) -> np.ndarray:
     return np.zeros(parts.plant.inputs) if parts.walk_rate is None else np.asarray(parts.walk_rate)
 
 
-class _Linear(NamedTuple):
+class _RunJacobians(NamedTuple):
     """Jacobians of each control period with respect to the initial state and to a constant torque.
 
     z (n,) are the plant's local coordinates at the start of the period. p (m,) is a torque on the plant that is
     constant in the period [N m].
     """
 
-    move: Array  # (periods, n, n) State at the end by z.
+    transition: Array  # (periods, n, n) State at the end by z.
     push: Array  # (periods, n, m) State at the end by p.
     error: Array  # (periods, 3 m, n) Error at the start, in the middle (interpolated) and at the end by z.
     error_push: Array  # (periods, 3 m, m) The same errors by p.
@@ -318,47 +324,47 @@ class _Linear(NamedTuple):
     now: Array  # (periods, readings, n) Readings of a sensor suite at the start of the period by z; else no rows.
 
 
-@programs.jit(compiler_options=programs.QUICKLY)
-def _linear(parts: Parts, log: Log, ticks: Ticks) -> _Linear:
+@programs.jit(compiler_options=programs.FAST_COMPILE)
+def _linearise_run(parts: Parts, log: Log, ticks: Ticks) -> _RunJacobians:
     """Linearise the simulation code of every period of a run."""
     actuators, kinematics, plant = parts.actuators, parts.controller.kinematics, parts.plant
     before, after = (jax.tree.map(lambda v, k=k: v[k : v.shape[0] - 1 + k], log.x) for k in (0, 1))
 
-    def acted(state: Any, now: tuple) -> tuple:
-        tick, x, commanded = now
+    def step_actuators(state: Any, entry: tuple) -> tuple:
+        tick, x, commanded = entry
         dt = tick.t_next - tick.t
         drive, queue = actuators.command(state, commanded, plant.velocity(x), tick.t, dt, tick.noise_weight)
         return actuators.end(state, drive, queue, dt), drive
 
-    _, drives = stacking.scan(acted, actuators.begin(plant.inputs), (ticks, before, log.commanded[:-1]))
+    _, drives = stacking.scan(step_actuators, actuators.begin(plant.inputs), (ticks, before, log.commanded[:-1]))
 
-    def period(tick: Ticks, x: Any, x_next: Any, drive: Any, disturbance: Array) -> _Linear:
+    def linearise_period(tick: Ticks, x: Any, x_next: Any, drive: Any, disturbance: Array) -> _RunJacobians:
         dt, target, target_next = tick.t_next - tick.t, parts.reference(tick.t), parts.reference(tick.t_next)
-        pushed = disturbance - parts.disturbance(tick.t, x)
+        extra_torque = disturbance - parts.disturbance(tick.t, x)
 
         def motion(x: Any, push: Array) -> PeriodMotion:
-            return PeriodMotion(parts, tick.t, x, drive, pushed + push)
+            return PeriodMotion(parts, tick.t, x, drive, extra_torque + push)
 
-        taken = star_state(parts, tick, motion(x, jnp.zeros_like(pushed)).at)
+        sampled = star_state(parts, tick, motion(x, jnp.zeros_like(extra_torque)).state_at)
         change = getattr(parts.sensors, "change", None)
 
-        def simulated(z: Float[Array, " n"], push: Float[Array, " m"]) -> tuple[Array, Array, Array, Array]:
+        def simulate_period(z: Float[Array, " n"], push: Float[Array, " m"]) -> tuple[Array, Array, Array, Array]:
             near = plant.retract(x, z)
-            moving, early, now = motion(near, push), jnp.zeros(0), jnp.zeros(0)
-            near_next = moving.after(dt)
+            near_motion, early, now = motion(near, push), jnp.zeros(0), jnp.zeros(0)
+            near_next = near_motion.state_after(dt)
             (start, rate), (end, rate_next) = kinematics.errors(near, target), kinematics.errors(near_next, target_next)
             middle = integrators.hermite_middle(start, rate, end, rate_next, dt)
-            near_taken = star_state(parts, tick, moving.at)
+            near_sampled = star_state(parts, tick, near_motion.state_at)
             if change is not None:
                 seen, near_seen = plant.visible(x), plant.visible(near)
-                early, now = change(seen, near_seen, taken, near_taken), change(seen, near_seen)
-            elif taken is not None:
-                early = parts.observer.model.local_coordinates(taken, near_taken)
+                early, now = change(seen, near_seen, sampled, near_sampled), change(seen, near_seen)
+            elif sampled is not None:
+                early = parts.observer.model.local_coordinates(sampled, near_sampled)
             return plant.local_coordinates(x_next, near_next), jnp.concatenate([start, middle, end]), early, now
 
-        still = jnp.zeros_like(plant.local_coordinates(x, x))
-        by = jax.jacfwd(simulated, argnums=(0, 1))(still, jnp.zeros(plant.inputs))
-        (move, push), (error, error_push), (early, early_push), (now, _) = by
-        return _Linear(move, push, error, error_push, early, early_push, now)
+        zero = jnp.zeros_like(plant.local_coordinates(x, x))
+        jacobians = jax.jacfwd(simulate_period, argnums=(0, 1))(zero, jnp.zeros(plant.inputs))
+        (transition, push), (error, error_push), (early, early_push), (now, _) = jacobians
+        return _RunJacobians(transition, push, error, error_push, early, early_push, now)
 
-    return lapack.vmap(period)(ticks, before, after, drives, log.disturbance[:-1])
+    return lapack.vmap(linearise_period)(ticks, before, after, drives, log.disturbance[:-1])

@@ -1,6 +1,6 @@
 """Margins along the nominal run of a sampled loop: in the hold phase, and in the approach phase with frozen gains.
 
-Read `along` first. It is the function behind `ptsmc margins`.
+Read `margins_along_run` first. It is the function behind `ptsmc margins`.
 """
 
 from typing import NamedTuple
@@ -16,7 +16,7 @@ from ptsmc_jax.numerics.pytrees import Scalar
 from ptsmc_jax.simulation import run_state
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.theory import limit_cycles, linear, margins
-from ptsmc_jax.theory.limit_cycles import History, history
+from ptsmc_jax.theory.limit_cycles import History, command_history
 from ptsmc_jax.theory.linear import Loop
 from ptsmc_jax.theory.margins import FIELDS, Margins
 
@@ -33,7 +33,7 @@ class Course(NamedTuple):
     loops: Loop  # The first axis of all arrays is the time.
     at_input: Margins  # (times, m) Margins of the loop opened at each input.
     at_sensors: Margins  # (k,) Margins of the loop opened at each measured signal, in the hold phase.
-    together: dict[str, float]  # Hold phase: margins against the same change in all inputs, see `margins.together`.
+    together: dict[str, float]  # Margins in the hold phase against the same change in all inputs.
     singularity_distance: float  # Smallest distance to the singularity, in the unit of `run_state.SINGULAR_DISTANCE`.
     not_converged: bool  # Whether the run has not converged at t_f, see `run_state.is_not_converged`.
     limit_cycle: limit_cycles.LimitCycle | None = None  # Limit cycle in the hold phase, if there is one.
@@ -67,7 +67,7 @@ def judged_times(parts: Parts) -> Float[Array, " times"]:
     return shortest * (longest / shortest) ** (jnp.arange(TIMES) / (TIMES - 1))
 
 
-def moments(parts: Parts, run: linear.Nominal, times: Array) -> Array:
+def find_period_indices(parts: Parts, run: linear.NominalRun, times: Array) -> Array:
     """Return the indices of the full control periods nearest to some times to go, and of one period in the hold phase.
 
     The period in the hold phase is the last period of the run. If the loop diverges, it is the last period that starts
@@ -82,19 +82,19 @@ def moments(parts: Parts, run: linear.Nominal, times: Array) -> Array:
     """
     ticks, law = run.period.now, parts.controller
     full = linear.is_full(ticks, parts.period)
-    off = lapack.vmap(lambda x, t: law.kinematics.errors(x, parts.reference(t))[0])(run.carry.x, ticks.t)
-    size, hold = jnp.linalg.norm(off, axis=1), full & ticks.hold
+    errors = lapack.vmap(lambda x, t: law.kinematics.errors(x, parts.reference(t))[0])(run.carry.x, ticks.t)
+    error_norm, hold = jnp.linalg.norm(errors, axis=1), full & ticks.hold
     first = jnp.argmax(hold)
-    near = hold & (size <= 2.0 * size[first])
-    last_near, end = (jnp.max(jnp.where(some, jnp.arange(hold.size), first)) for some in (near, hold))
-    last = jnp.maximum(last_near, jnp.minimum(first + linear.averaged(parts) - 1, end))
+    is_near = hold & (error_norm <= 2.0 * error_norm[first])
+    last_near, end = (jnp.max(jnp.where(candidates, jnp.arange(hold.size), first)) for candidates in (is_near, hold))
+    last = jnp.maximum(last_near, jnp.minimum(first + linear.averaging_periods(parts) - 1, end))
     before = full & ~law.in_hold(ticks.t, ticks.t_next, ticks.hold)
-    left = jnp.where(before, law.t_f - ticks.t, jnp.inf)
-    nearest = jnp.argmin(jnp.abs(left[None] - times[:, None]), axis=1)
+    time_to_go = jnp.where(before, law.t_f - ticks.t, jnp.inf)
+    nearest = jnp.argmin(jnp.abs(time_to_go[None] - times[:, None]), axis=1)
     return jnp.append(jnp.where(jnp.any(before), nearest, last), last)
 
 
-_moments = programs.jit(moments)
+_find_period_indices_jit = programs.jit(find_period_indices)
 
 
 class TimedMargins(NamedTuple):
@@ -106,22 +106,26 @@ class TimedMargins(NamedTuple):
     margins: Margins  # (times, m)
 
 
-def at(parts: Parts, left: Float[Array, " times"], simulated: linear.Nominal | None = None) -> TimedMargins:
+def margins_at(
+    parts: Parts, times_to_go: Float[Array, " times"], simulated: linear.NominalRun | None = None
+) -> TimedMargins:
     """Return the margins at some times to go and in the hold phase.
 
     Args:
         parts: the sampled scenario.
-        left: times to go (times,) [s].
+        times_to_go: times to go (times,) [s].
         simulated: its nominal run, or None to simulate it.
     """
-    run: linear.Nominal = linear.nominal_jit(parts) if simulated is None else simulated
-    indices = np.asarray(_moments(parts, run, left))
-    loops = linear.loops_in(parts, run, indices)
+    run: linear.NominalRun = linear.simulate_nominal_jit(parts) if simulated is None else simulated
+    indices = np.asarray(_find_period_indices_jit(parts, run, times_to_go))
+    loops = linear.open_loops(parts, run, indices)
     ticks = jax.tree.map(lambda v: np.asarray(v)[indices], run.period.now)
-    return TimedMargins(ticks.t, ticks.hold, loops, margins.in_turn(loops))
+    return TimedMargins(ticks.t, ticks.hold, loops, margins.compute_in_batches(loops))
 
 
-def judged_loops(parts: Parts, simulated: linear.Nominal | None = None, *, late: bool = True) -> tuple[Loop, Array]:
+def judged_loops(
+    parts: Parts, simulated: linear.NominalRun | None = None, *, fractional_delays: bool = True
+) -> tuple[Loop, Array]:
     """Return the loops at the `judged_times` and in the hold phase, and which of them are in the hold phase.
 
     The first axis (times + 1) of the loops is the time; the last one is in the hold phase. The unit of h is [s].
@@ -129,98 +133,109 @@ def judged_loops(parts: Parts, simulated: linear.Nominal | None = None, *, late:
     Args:
         parts: the sampled scenario.
         simulated: its nominal run, or None to simulate it.
-        late: whether the loops support fractional delays, see `linear.opened`.
+        fractional_delays: whether the loops support fractional delays, see `linear.linearise_period`.
     """
-    run = linear.nominal(parts) if simulated is None else simulated
-    indices = moments(parts, run, judged_times(parts))
-    return linear.loops_at(parts, run, indices, late=late), run.period.now.hold[indices]
+    run = linear.simulate_nominal(parts) if simulated is None else simulated
+    indices = find_period_indices(parts, run, judged_times(parts))
+    loops = linear.open_loops_traced(parts, run, indices, fractional_delays=fractional_delays)
+    return loops, run.period.now.hold[indices]
 
 
 def judged_margins(parts: Parts) -> tuple[Margins, Array, History]:
-    """Return the margins of `judged_loops` (times + 1, m), which of them are in the hold phase, and the commands.
+    """Return the margins at the `judged_times` and in the hold phase, and the commands of the nominal run.
 
-    The function supports all JAX transformations.
+    The margins are (times + 1, m). The second result marks the entries in the hold phase, (times + 1,) bool. The
+    function supports all JAX transformations.
     """
-    run = linear.nominal(parts)
+    run = linear.simulate_nominal(parts)
     loops, hold = judged_loops(parts, run)
-    return margins.compute_each(loops), hold, history(parts, run)
+    return margins.compute_each(loops), hold, command_history(parts, run)
 
 
 judged_margins_jit = programs.jit(
-    judged_margins, compiler_options=programs.QUICKLY, title="the margins of the nominal run"
+    judged_margins, compiler_options=programs.FAST_COMPILE, title="the margins of the nominal run"
 )
 
 
-def judged(parts: Parts) -> tuple[Margins, np.ndarray, limit_cycles.LimitCycle | None]:
-    """Return the margins of `judged_loops` (times + 1, m), which of them are in the hold phase, and the limit cycle.
+def judge_run(parts: Parts) -> tuple[Margins, np.ndarray, limit_cycles.LimitCycle | None]:
+    """Return the margins at the `judged_times` and in the hold phase, and the limit cycle of the nominal run.
 
-    If there is a limit cycle, the margins in the hold phase are zero, see `limit_cycles`.
+    The margins are (times + 1, m). The second result marks the entries in the hold phase, (times + 1,) bool. If
+    there is a limit cycle, the margins in the hold phase are zero, see `limit_cycles`.
     """
-    found, hold, commands = jax.tree.map(np.asarray, judged_margins_jit(parts))
+    values, hold, commands = jax.tree.map(np.asarray, judged_margins_jit(parts))
     limit_cycle = limit_cycles.find(parts, commands)
-    return (found if limit_cycle is None else limit_cycles.without_margins(found, hold)), hold, limit_cycle
+    return (values if limit_cycle is None else limit_cycles.zero_margins(values, hold)), hold, limit_cycle
 
 
-def along(parts: Parts, times: int = 24) -> Course:
+def margins_along_run(parts: Parts, times: int = 24) -> Course:
     """Return the margins of sampled parts along their nominal run.
 
     The times are the judged ones, one in the hold phase, and about `times` further ones. If there is a limit cycle, the
     margins in the hold phase are zero, see `limit_cycles`.
     """
-    run = linear.nominal_jit(parts)
-    looked_at, commands, singularity_distance, not_converged = _along(parts, run, times)
-    at_times = at(parts, looked_at, run)
-    first_at = {t: k for k, t in reversed(list(enumerate(at_times.t.tolist()))) if not at_times.hold[k]}
-    order = np.asarray([k for _, k in sorted(first_at.items())] + [len(at_times.t) - 1])
+    run = linear.simulate_nominal_jit(parts)
+    times_to_go, commands, singularity_distance, not_converged = _run_data(parts, run, times)
+    at_times = margins_at(parts, times_to_go, run)
+    index_at = {t: k for k, t in reversed(list(enumerate(at_times.t.tolist()))) if not at_times.hold[k]}
+    order = np.asarray([k for _, k in sorted(index_at.items())] + [len(at_times.t) - 1])
     t, _, loops, at_input = jax.tree.map(lambda v: v[order], at_times)
-    counts = (order < TIMES) | (order == order[-1])
+    judged = (order < TIMES) | (order == order[-1])
     last = jax.tree.map(lambda v: v[-1:], loops)
     at_sensors = margins.compute_each(last, sensors=True)
     limit_cycle = limit_cycles.find(parts, commands)
     if limit_cycle is None:
-        at_once = margins.together(jax.tree.map(lambda v: v[0], last))
+        together = margins.simultaneous_margins(jax.tree.map(lambda v: v[0], last))
     else:
-        at_once = dict.fromkeys(FIELDS, float("nan"))
+        together = dict.fromkeys(FIELDS, float("nan"))
         at_input, at_sensors = (
-            limit_cycles.without_margins(at_input, order == order[-1]),
-            limit_cycles.without_margins(at_sensors, [True]),
+            limit_cycles.zero_margins(at_input, order == order[-1]),
+            limit_cycles.zero_margins(at_sensors, [True]),
         )
     at_sensors = jax.tree.map(lambda v: np.asarray(v)[0], at_sensors)
     return Course(
-        t, counts, loops, at_input, at_sensors, at_once, float(singularity_distance), bool(not_converged), limit_cycle
+        t,
+        judged,
+        loops,
+        at_input,
+        at_sensors,
+        together,
+        float(singularity_distance),
+        bool(not_converged),
+        limit_cycle,
     )
 
 
-@programs.jit(static_argnames="times", compiler_options=programs.QUICKLY)
-def _along(parts: Parts, run: linear.Nominal, times: int) -> tuple[Array, History, Scalar, Array]:
-    """Return the data of `along` that one compiled program computes.
+@programs.jit(static_argnames="times", compiler_options=programs.FAST_COMPILE)
+def _run_data(parts: Parts, run: linear.NominalRun, times: int) -> tuple[Array, History, Scalar, Array]:
+    """Return the data of `margins_along_run` that one compiled program computes.
 
     Returns:
         The times to go (TIMES + times,) [s], judged ones first; the commands; the smallest distance to the law's
         singularity [-]; whether the run has not converged at t_f.
     """
     law = parts.controller
-    besides = jnp.geomspace(parts.period, law.t_f, times)
-    clear = lapack.vmap(lambda x, t: law.singularity_distance(x, parts.reference(t)))(run.carry.x, run.period.now.t)
-    nearest = jnp.min(clear / law.kinematics.singularity_distance_unit(clear[0]))
+    further_times = jnp.geomspace(parts.period, law.t_f, times)
+    distances = lapack.vmap(lambda x, t: law.singularity_distance(x, parts.reference(t)))(run.carry.x, run.period.now.t)
+    nearest = jnp.min(distances / law.kinematics.singularity_distance_unit(distances[0]))
     t = run.period.now.t
-    first, arrived = (
+    first_angle, final_angle = (
         law.kinematics.angle(jax.tree.map(lambda v, k=k: v[k], run.carry.x), parts.reference(t[k]))
         for k in (0, jnp.argmax(t >= law.t_f))
     )
-    not_converged = run_state.is_not_converged(arrived, first, parts.settling_angle)
-    return jnp.append(judged_times(parts), besides), history(parts, run), nearest, not_converged
+    not_converged = run_state.is_not_converged(final_angle, first_angle, parts.settling_angle)
+    return jnp.append(judged_times(parts), further_times), command_history(parts, run), nearest, not_converged
 
 
-def at_ends(parts: Parts) -> dict[str, tuple[Margins, float]]:
+def margins_at_ends(parts: Parts) -> dict[str, tuple[Margins, float]]:
     """Return the margins and the spectral radius at the last full period before the "hand_over" and in "hold".
 
     If there is no full period before the hand-over, both are those of the hold phase.
     """
-    run = linear.nominal_jit(parts)
-    before = linear.full_periods(parts, run, hold=False)[-1:]
-    left = float(parts.controller.t_f) - np.asarray(run.period.now.t)[before]
-    both = at(parts, jnp.asarray(left), run)
+    run = linear.simulate_nominal_jit(parts)
+    last_before = linear.full_periods(parts, run, hold=False)[-1:]
+    time_to_go = float(parts.controller.t_f) - np.asarray(run.period.now.t)[last_before]
+    timed = margins_at(parts, jnp.asarray(time_to_go), run)
     ends = {"hand_over": 0, "hold": -1}
-    each = {name: jax.tree.map(lambda v, k=k: v[k], (both.margins, both.loops)) for name, k in ends.items()}
-    return {name: (seen, linear.radius(loop)) for name, (seen, loop) in each.items()}
+    by_end = {name: jax.tree.map(lambda v, k=k: v[k], (timed.margins, timed.loops)) for name, k in ends.items()}
+    return {name: (values, linear.spectral_radius(loop)) for name, (values, loop) in by_end.items()}

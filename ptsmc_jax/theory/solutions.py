@@ -17,10 +17,10 @@ from ptsmc_jax.batching import lapack
 from ptsmc_jax.numerics import guards
 from ptsmc_jax.numerics.pytrees import Scalar
 from ptsmc_jax.simulation.assembly import Setup
+from ptsmc_jax.theory.closed_forms import derivatives_from_scaled, scaled_responses
 from ptsmc_jax.theory.closed_forms import exact_chain as exact_chain
 from ptsmc_jax.theory.closed_forms import exact_error as exact_error
-from ptsmc_jax.theory.closed_forms import from_modes, modes
-from ptsmc_jax.theory.exact_motion import exact, exact_motion, plant_motion
+from ptsmc_jax.theory.exact_motion import exact_error_and_s, exact_motion, plant_motion
 
 Vector = Float[Array, " n"]
 
@@ -45,20 +45,20 @@ def state_envelope(
         residual: coefficient c of tau^n, see `envelopes.sliding_envelope`.
     """
     n, tau = x0.shape[0], t_f - t
-    free, forced = modes(t, t_f, eta, x0)
+    free, forced = scaled_responses(t, t_f, eta, x0)
     scale = jnp.sqrt(residual) * tau ** (n / 2)  # bound on |s| inside the boundary layer
     widths = []
     for j in range(n):
         p = n - 2 - j
         factor = 1.0 / ((eta - n / 2 + j) * math.factorial(p)) if p >= 0 else 1.0
-        left = scale * factor * tau**-j * (t_f / tau) ** eta
-        widths.append(jnp.abs(s0 * forced[j]) + left)
-    centre = from_modes(t, t_f, eta, free)[:n]
-    half = from_modes(t, t_f, eta, [*widths, jnp.zeros_like(tau)], jnp.abs)[:n]
+        layer_width = scale * factor * tau**-j * (t_f / tau) ** eta
+        widths.append(jnp.abs(s0 * forced[j]) + layer_width)
+    centre = derivatives_from_scaled(t, t_f, eta, free)[:n]
+    half = derivatives_from_scaled(t, t_f, eta, [*widths, jnp.zeros_like(tau)], jnp.abs)[:n]
     return jnp.stack(centre), jnp.stack(half)
 
 
-def bare(parts: Setup) -> Setup:
+def without_devices(parts: Setup) -> Setup:
     """Return the parts without clock and devices.
 
     The exact motion does not depend on them, so that one compiled program serves all scenarios.
@@ -67,7 +67,7 @@ def bare(parts: Setup) -> Setup:
     return Setup(**{name: getattr(parts, name) for name in names}, observer=None)
 
 
-def starts(parts: Setup) -> Float[Array, "m n"]:
+def initial_errors(parts: Setup) -> Float[Array, "m n"]:
     """Return each component of the error and its derivatives x_1 .. x_n at t = 0, in the states' own units."""
     kinematics, target = parts.controller.kinematics, parts.reference(jnp.zeros_like(parts.t_end))
     return kinematics.derivatives(parts.aligned_initial, target)
@@ -75,17 +75,17 @@ def starts(parts: Setup) -> Float[Array, "m n"]:
 
 def exact_sizes(parts: Setup, t: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Return the 2-norms of the error and of s along the exact motion at times t (time,) [s] in the approach phase."""
-    error, s = _exact_sizes(bare(parts), jnp.asarray(t))
+    error, s = _exact_sizes(without_devices(parts), jnp.asarray(t))
     return np.asarray(error), np.asarray(s)
 
 
 @programs.jit
 def _exact_sizes(parts: Setup, t: Array) -> tuple[Array, Array]:
-    def sizes(time: Scalar) -> tuple[Scalar, Scalar]:
-        error, s = exact(parts.controller, time, starts(parts))
+    def norms(time: Scalar) -> tuple[Scalar, Scalar]:
+        error, s = exact_error_and_s(parts.controller, time, initial_errors(parts))
         return guards.norm(error), guards.norm(s)
 
-    return jax.vmap(sizes)(t)
+    return jax.vmap(norms)(t)
 
 
 def exact_input(parts: Setup, t: Scalar) -> tuple[Array, Scalar]:
@@ -94,36 +94,36 @@ def exact_input(parts: Setup, t: Scalar) -> tuple[Array, Scalar]:
     For attitudes this distance is 1 - |v|^2 [-], the square of the scalar part. The motion does not exist if it is 0
     or less.
     """
-    motion = exact_motion(parts.controller, t, parts.reference(t), parts.initial, starts(parts))
+    motion = exact_motion(parts.controller, t, parts.reference(t), parts.initial, initial_errors(parts))
     d = parts.disturbance(t, parts.plant.with_hidden_at_rest(motion.x))
-    plant = parts.plant.to_plan_by(parts.controller.model)
+    plant = parts.plant.planning_plant(parts.controller.model)
     return plant.input_for(t, motion.x, motion.w_dot, d), motion.singularity_distance
 
 
-def visited(parts: Setup) -> tuple[Array, Any]:
+def visited_states(parts: Setup) -> tuple[Array, Any]:
     """Return targets and states of a second-order run, (2 VISITED,) each, in the states' own units.
 
     The first half is on the exact motion, at times that become denser toward the hand-over. In the second half the
     error is zero.
     """
-    return _visited(bare(parts))
+    return _visited_states(without_devices(parts))
 
 
 @programs.jit
-def _visited(parts: Setup) -> tuple[Array, Any]:
+def _visited_states(parts: Setup) -> tuple[Array, Any]:
     law, fractions = parts.controller, jnp.linspace(0.0, 1.0, VISITED)
-    none = (jnp.zeros(parts.plant.inputs),) * 3
+    zero_errors = (jnp.zeros(parts.plant.inputs),) * 3
 
-    def approaching(t: Scalar) -> tuple[Any, Any]:
+    def on_exact_motion(t: Scalar) -> tuple[Any, Any]:
         target = parts.reference(t)
-        return target, exact_motion(law, t, target, parts.initial, starts(parts)).x
+        return target, exact_motion(law, t, target, parts.initial, initial_errors(parts)).x
 
-    def without_error(t: Scalar) -> tuple[Any, Any]:
+    def at_zero_error(t: Scalar) -> tuple[Any, Any]:
         target = parts.reference(t)
-        return target, plant_motion(law.kinematics, target, parts.initial, none).x
+        return target, plant_motion(law.kinematics, target, parts.initial, zero_errors).x
 
-    early = lapack.vmap(approaching)(law.t_f - law.t_f * (law.delta / law.t_f) ** fractions)
-    late = lapack.vmap(without_error)(parts.t_end * fractions)
+    early = lapack.vmap(on_exact_motion)(law.t_f - law.t_f * (law.delta / law.t_f) ** fractions)
+    late = lapack.vmap(at_zero_error)(parts.t_end * fractions)
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), early, late)
 
 
@@ -132,7 +132,7 @@ def exact_path(parts: Setup, points: int = 2000) -> tuple[Array, Array, Array]:
 
     See `exact_input`.
     """
-    return _exact_path(bare(parts), points)
+    return _exact_path(without_devices(parts), points)
 
 
 @programs.jit(static_argnames="points")

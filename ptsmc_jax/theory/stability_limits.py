@@ -12,7 +12,7 @@ import numpy as np
 
 
 def gains(
-    t: np.ndarray, t_f: float, eta: float, delta: float, k1: float, slope: float, surface_rate: float
+    t: np.ndarray, t_f: float, eta: float, delta: float, k1: float, switching_derivative: float, surface_rate: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the gains kp [1/s^2] and kd [1/s] of the frozen loop, (times,) each.
 
@@ -27,19 +27,19 @@ def gains(
         eta: exponent of the law [-].
         delta: time between the hand-over and t_f [s].
         k1: K1 of (60) [1/s].
-        slope: derivative of the switching term in the boundary layer, |T J^-1| K2 / sign_width.
+        switching_derivative: derivative of the switching term in the boundary layer, |T J^-1| K2 / sign_width.
         surface_rate: c [1/s].
     """
     tau = t_f - np.asarray(t, dtype=float)
     hold = tau <= delta * (1 + 1e-9)
     safe = np.where(hold, 1.0, tau)
-    after = (k1 + slope) / 2
-    kp = np.where(hold, surface_rate * after, eta**2 / safe**2 + slope * eta / 2)
-    kd = np.where(hold, surface_rate + after, (2 * eta - 1) / safe + slope * safe / 2)
+    after = (k1 + switching_derivative) / 2
+    kp = np.where(hold, surface_rate * after, eta**2 / safe**2 + switching_derivative * eta / 2)
+    kd = np.where(hold, surface_rate + after, (2 * eta - 1) / safe + switching_derivative * safe / 2)
     return kp, kd
 
 
-def _closed(kp: float, kd: float, h: float, delay: float) -> np.ndarray:
+def _transition_matrix(kp: float, kd: float, h: float, delay: float) -> np.ndarray:
     """Return the transition matrix (n, n) of the frozen loop over one period.
 
     Args:
@@ -49,31 +49,32 @@ def _closed(kp: float, kd: float, h: float, delay: float) -> np.ndarray:
         delay: delay of the command in periods, whole or fractional, at least 0.
     """
     whole = int(np.floor(delay))
-    part = delay - whole  # fraction of the period; then the command of `whole` periods ago replaces the older command
-    n = 2 + whole + (part > 0)
+    # after this fraction of the period, the command of `whole` periods ago replaces the older command
+    fraction = delay - whole
+    n = 2 + whole + (fraction > 0)
     move = np.eye(n)
     move[0, 1] = h
 
-    def push(begin: float, end: float) -> tuple[float, float]:
+    def acceleration_effect(begin: float, end: float) -> tuple[float, float]:
         """Return the changes of eps and eps' at the end of the period by a unit acceleration from `begin` to `end`."""
         a, b = begin * h, end * h
         return (h - a) ** 2 / 2 - (h - b) ** 2 / 2, b - a
 
-    late_push, early_push = push(part, 1.0), push(0.0, part)
+    late_push, early_push = acceleration_effect(fraction, 1.0), acceleration_effect(0.0, fraction)
     feedback = np.array([-kp, -kd])
     # the state is eps, eps' and the delayed commands, newest first
     if whole == 0:
         move[:2, :2] += np.outer(late_push, feedback)
     else:
         move[:2, 1 + whole] += late_push
-    if part > 0:
+    if fraction > 0:
         move[:2, 2 + whole] += early_push
     move[2:] = np.eye(n - 2, n, k=1)
     move[2:3, :2] = feedback
     return move
 
 
-def radius(kp: float, kd: float, h: float, delay: float = 0.0) -> float:
+def spectral_radius(kp: float, kd: float, h: float, delay: float = 0.0) -> float:
     """Return the spectral radius of the frozen loop [-]. The loop is stable below 1.
 
     Args:
@@ -82,10 +83,10 @@ def radius(kp: float, kd: float, h: float, delay: float = 0.0) -> float:
         h: control period [s].
         delay: delay of the command in periods, whole or fractional, at least 0.
     """
-    return float(np.abs(np.linalg.eigvals(_closed(kp, kd, h, delay))).max())
+    return float(np.abs(np.linalg.eigvals(_transition_matrix(kp, kd, h, delay))).max())
 
 
-def _last(stable: Callable[[float], bool], low: float, high: float) -> float:
+def _largest_stable(stable: Callable[[float], bool], low: float, high: float) -> float:
     """Return the largest number for which `stable` is true, by bisection, or infinity if it is true at `high`."""
     if stable(high):
         return float("inf")
@@ -129,9 +130,9 @@ def largest_index(eta: float, delay: float = 0.0, *, implicit: bool = False) -> 
     def stable(index: float) -> bool:
         tau = (2 * eta - 1) / index
         kp, kd = implicit_gains(eta, tau) if implicit else ((eta / tau) ** 2, (2 * eta - 1) / tau)
-        return radius(kp, kd, 1.0, delay) < 1.0
+        return spectral_radius(kp, kd, 1.0, delay) < 1.0
 
-    return _last(stable, 1e-6, (2 * eta - 1) * (1 - 1e-9) if implicit else 4.0)
+    return _largest_stable(stable, 1e-6, (2 * eta - 1) * (1 - 1e-9) if implicit else 4.0)
 
 
 def smallest_delta(eta: float, h: float, delay: float = 0.0, *, anchored: bool = True, implicit: bool = False) -> float:
@@ -150,8 +151,8 @@ def smallest_delta(eta: float, h: float, delay: float = 0.0, *, anchored: bool =
         anchored: whether the clock is the anchored one; otherwise it is the flight clock.
         implicit: whether the law uses implicit sampling.
     """
-    before = float(anchored) + float(implicit)
-    return max(0.0, ((2 * eta - 1) / largest_index(eta, delay, implicit=implicit) - before) * h)
+    extra_periods = float(anchored) + float(implicit)
+    return max(0.0, ((2 * eta - 1) / largest_index(eta, delay, implicit=implicit) - extra_periods) * h)
 
 
 def largest_surface(delay: int = 0, *, implicit: bool = False) -> float:
@@ -188,8 +189,8 @@ def largest_reaching(surface: float, delay: float = 0.0, *, implicit: bool = Fal
     def stable(reaching: float) -> bool:
         kp, kd = surface * reaching, surface + reaching
         if implicit:
-            moved = -np.expm1(-reaching)
-            kp, kd = surface * moved / (1 + surface / 2), (surface + moved) / (1 + surface / 2)
-        return radius(kp, kd, 1.0, delay) < 1.0
+            decrease = -np.expm1(-reaching)
+            kp, kd = surface * decrease / (1 + surface / 2), (surface + decrease) / (1 + surface / 2)
+        return spectral_radius(kp, kd, 1.0, delay) < 1.0
 
-    return _last(stable, 1e-6, 40.0 if implicit else 4.0) if stable(1e-6) else 0.0
+    return _largest_stable(stable, 1e-6, 40.0 if implicit else 4.0) if stable(1e-6) else 0.0

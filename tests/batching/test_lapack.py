@@ -21,10 +21,10 @@ pytestmark = pytest.mark.skipif(not lapack.CAN_DEADLOCK, reason="this jaxlib can
 
 
 def lapack_calls(trace):
-    """Return the operations of the largest LAPACK call in a trace, and whether a primitive of `SHARED` is batched."""
-    found = [e for e in equations(trace) if e.primitive.name in lapack.COUNTED | lapack.SHARED]
+    """Return the operations of the largest LAPACK call in a trace, and whether one of `NEVER_BATCHED` is batched."""
+    found = [e for e in equations(trace) if e.primitive.name in lapack.SIZE_LIMITED | lapack.NEVER_BATCHED]
     assert found
-    is_batched = any(e.primitive.name in lapack.SHARED and e.invars[0].aval.ndim > 2 for e in found)
+    is_batched = any(e.primitive.name in lapack.NEVER_BATCHED and e.invars[0].aval.ndim > 2 for e in found)
     return max(e.invars[-1].aval.size * e.invars[0].aval.shape[-1] for e in found), is_batched
 
 
@@ -93,9 +93,9 @@ class EighReference(ptsmc.Reference):
 
 @pytest.fixture
 def batched_calls(monkeypatch):
-    """Batched calls of the primitives in `SHARED` in any trace."""
+    """Batched calls of the primitives in `NEVER_BATCHED` in any trace."""
     calls = []
-    for p in (p for p in vars(core.primitives).values() if getattr(p, "name", None) in lapack.SHARED):
+    for p in (p for p in vars(core.primitives).values() if getattr(p, "name", None) in lapack.NEVER_BATCHED):
 
         def bind(*args, p=p, bound=p.bind, **params):
             calls.extend(f"{p.name} of {v.shape}" for v in args[:1] if v.ndim > 2)
@@ -114,11 +114,11 @@ CUSTOM = {
 
 def trace_analyses(parts, dispersion):
     """Trace the moments and the rest point of the loop, the test vectors of the C export, and predicted peaks."""
-    trials, seed, run = jnp.arange(4, dtype=jnp.uint32), jnp.uint32(0), jax.eval_shape(linear.nominal, parts)
-    run_margins._moments.trace(parts, run, run_margins.judged_times(parts))
+    trials, seed, run = jnp.arange(4, dtype=jnp.uint32), jnp.uint32(0), jax.eval_shape(linear.simulate_nominal, parts)
+    run_margins._find_period_indices_jit.trace(parts, run, run_margins.judged_times(parts))
     limit_cycles._nonlinear_residual.trace(parts, run)
     vectors.simulate_many.trace(parts, dispersion, seed, trials)
-    design._predicted.trace(parts, dispersion, seed, trials, jnp.asarray(3.0))
+    design._predict_peaks.trace(parts, dispersion, seed, trials, jnp.asarray(3.0))
 
 
 @pytest.mark.filterwarnings("ignore::ptsmc_jax.batching.lanes.LanesWarning")  # `jax.vmap` evaluates eigh
@@ -132,18 +132,20 @@ def test_analyses_of_a_system_never_batch_eigh(batched_calls):
     }
     studied = scenario.study(scenario.from_tables(CUSTOM | of_system))
     parts, dispersion = studied.parts, studied.dispersion
-    visited = jax.eval_shape(solutions.visited, parts)
-    timing._boundary_layer.trace(parts.controller, parts.observer, visited)
+    visited = jax.eval_shape(solutions.visited_states, parts)
+    timing._layer_rates.trace(parts.controller, parts.observer, visited)
     trace_analyses(parts, dispersion)
-    run = jax.eval_shape(linear.nominal, parts)
+    run = jax.eval_shape(linear.simulate_nominal, parts)
     some = jax.tree.map(lambda v: jnp.ones((4, *v.shape[1:]), v.dtype), run)
     trials = jnp.arange(margin_verdicts.LOOPS_PER_CALL, dtype=jnp.uint32)
     of_periods = jax.tree.map(lambda v: jnp.ones(v.shape, v.dtype), run)
     traces = {
-        "loops": linear._opened.trace(parts, some, None, late=True),
-        "loops of traced parts": jax.make_jaxpr(lambda k: linear.loops_at(parts, of_periods, k))(jnp.arange(4)),
+        "loops": linear._linearise_batch.trace(parts, some, None, fractional_delays=True),
+        "loops of traced parts": jax.make_jaxpr(lambda k: linear.open_loops_traced(parts, of_periods, k))(
+            jnp.arange(4)
+        ),
         "loops of trials": margin_verdicts._loops_and_margins.trace(parts, dispersion, jnp.uint32(0), trials, 1, True),
-        "steps": timing._rates_of_system.trace(parts, (jnp.linspace(0.0, 1.0, 4), jnp.ones((4, 4)))),
+        "steps": timing._system_rates.trace(parts, (jnp.linspace(0.0, 1.0, 4), jnp.ones((4, 4)))),
     }
     assert not any(lapack_calls(trace.jaxpr)[1] for trace in traces.values())
     assert not batched_calls

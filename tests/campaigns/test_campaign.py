@@ -95,13 +95,16 @@ def test_failed_trials_do_not_affect_the_others():
 def test_missing_parts_of_a_campaign():
     part, nowhere = rows.Part, Path()
     full = campaign.PART
-    assert campaign.missing([], 10) == [(0, 10)]
-    assert campaign.missing([], 2 * full + 1) == [(0, full), (full, full), (2 * full, 1)]
+    assert campaign.missing_parts([], 10) == [(0, 10)]
+    assert campaign.missing_parts([], 2 * full + 1) == [(0, full), (full, full), (2 * full, 1)]
     there = [part(0, full, nowhere), part(2 * full, 1, nowhere)]
-    assert campaign.missing(there, 2 * full + 1) == [(full, full)]
-    assert campaign.missing(there, 3 * full) == [(full, full), (2 * full, full)]  # the short last part is repeated
-    shards = [campaign.missing([], 7 * full, (k, 3)) for k in (1, 2, 3)]
-    assert sorted(chain(*shards)) == campaign.missing([], 7 * full)
+    assert campaign.missing_parts(there, 2 * full + 1) == [(full, full)]
+    assert campaign.missing_parts(there, 3 * full) == [
+        (full, full),
+        (2 * full, full),
+    ]  # the short last part is repeated
+    shards = [campaign.missing_parts([], 7 * full, (k, 3)) for k in (1, 2, 3)]
+    assert sorted(chain(*shards)) == campaign.missing_parts([], 7 * full)
     assert [len(shard) for shard in shards] == [3, 2, 2]
 
 
@@ -111,8 +114,8 @@ def test_parts_are_written_one_after_the_other(simulated, tmp_path, monkeypatch)
     kept = rows.Rows(tmp_path / "trials", b"k")
     seen = []
     campaign.report_progress(
-        campaign.make_parts(made.simulate, kept, campaign.missing([], 300)),
-        campaign.tally([], 300),
+        campaign.make_parts(made.simulate, kept, campaign.missing_parts([], 300)),
+        campaign.count_progress([], 300),
         lambda standing: seen.append((standing.done, standing.total, standing.failed)),
     )
     assert seen == [(0, 300, 0), (100, 300, 0), (200, 300, 0), (300, 300, 0)]
@@ -133,7 +136,7 @@ def test_parts_simulated_in_one_call_are_the_same(simulated, tmp_path, monkeypat
         return made.simulate(trials)
 
     kept = rows.Rows(tmp_path / "trials", b"k")
-    wanted = campaign.missing([], 300, (2, 2))
+    wanted = campaign.missing_parts([], 300, (2, 2))
     assert wanted == [(40, 40), (120, 40), (200, 40), (280, 20)]
     landed = [part for part, _ in campaign.make_parts(make, kept, wanted)]
     assert flights == {2: [80, 60], 3: [120, 20], 16: [140]}[together]
@@ -154,7 +157,9 @@ def test_finished_parts_remain_if_a_later_part_fails(simulated, tmp_path, monkey
 
     with pytest.raises(KeyboardInterrupt):
         campaign.report_progress(
-            campaign.make_parts(make, kept, campaign.missing([], 300)), campaign.tally([], 300), lambda _: None
+            campaign.make_parts(make, kept, campaign.missing_parts([], 300)),
+            campaign.count_progress([], 300),
+            lambda _: None,
         )
     assert [part.first for part in kept.parts()[0]] == [0, 100]
 
@@ -166,7 +171,7 @@ def test_failures_are_counted_in_the_progress(simulated, tmp_path):
         status=pl.when(pl.col("trial") % 3 == 0).then(pl.lit("diverged")).otherwise(pl.col("status"))
     )
     kept.write(0, worse)
-    assert campaign.tally(kept.parts()[0], 900) == campaign.Tally(300, 900, 100)
+    assert campaign.count_progress(kept.parts()[0], 900) == campaign.Tally(300, 900, 100)
 
 
 def overshoot(result, parts):
@@ -220,7 +225,7 @@ def test_invalid_custom_metrics_are_refused(simulated, made_of, said):
 
 def test_histories_equal_those_of_single_runs(simulated):
     made, _ = simulated
-    t, error = campaign.history(made, np.array([3, 250], dtype=np.uint32))
+    t, error = campaign.error_history(made, np.array([3, 250], dtype=np.uint32))
     for k, trial in enumerate((3, 250)):
         log = runs.simulate(made.ready, 3, trial).log
         np.testing.assert_allclose(t, log.t, rtol=1e-14)

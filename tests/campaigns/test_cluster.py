@@ -50,21 +50,21 @@ def simulated_by(monkeypatch, tmp_path, receipt):
 
 def test_tls_files_are_passed_to_dask_and_require_encryption():
     files = {"tls_ca_file": "ca.pem", "tls_client_cert": "cert.pem", "tls_client_key": "key.pem"}
-    found = cluster.connected("tls://10.0.0.1:8786", files)
+    found = cluster.connect("tls://10.0.0.1:8786", files)
     security = FakeClient.made.options["security"]
     assert FakeClient.made.options["address"] == "tls://10.0.0.1:8786"
     assert {name: getattr(security, name) for name in files} == files
     assert security.require_encryption is True
     found.close()
     assert FakeClient.made.closed
-    cluster.connected("tcp://127.0.0.1:8786", {})
+    cluster.connect("tcp://127.0.0.1:8786", {})
     assert FakeClient.made.options["security"] is None
 
 
 def test_a_local_cluster_listens_on_the_loopback_only(monkeypatch):
     asked = {}
     monkeypatch.setattr(distributed, "LocalCluster", lambda **options: asked.update(options) or SimpleNamespace())
-    cluster.connected("local:3", {})
+    cluster.connect("local:3", {})
     assert (asked["host"], asked["n_workers"], asked["threads_per_worker"]) == ("127.0.0.1", 3, 1)
 
 
@@ -72,7 +72,7 @@ def test_results_of_workers_become_parts(monkeypatch, tmp_path):
     here = store.packages()
     (tmp_path / "p.parquet").write_bytes(b"")
     folder = simulated_by(monkeypatch, tmp_path, lambda first, count: (first, count, "p.parquet", 7, here))
-    found = list(cluster.connected("tcp://a:1", {})(folder, [(0, 10), (10, 5)]))
+    found = list(cluster.connect("tcp://a:1", {})(folder, [(0, 10), (10, 5)]))
     assert [(part.first, part.count, failed) for part, failed in found] == [(0, 10, 7), (10, 5, 7)]
 
 
@@ -94,11 +94,11 @@ def test_results_of_other_versions_or_failed_workers_are_refused(monkeypatch, tm
 
     folder = simulated_by(monkeypatch, tmp_path, receipt)
     with pytest.raises(RefusedError, match=said):
-        list(cluster.connected("tcp://a:1", {})(folder, [(0, 10)]))
+        list(cluster.connect("tcp://a:1", {})(folder, [(0, 10)]))
     assert len(FakeClient.made.cancelled) == 1  # the other futures are cancelled
 
 
 def test_missing_dask_is_reported_with_the_command_to_install_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(RefusedError, match=r"pip install 'ptsmc-jax\[cluster\]'"):
-        cluster.connected("tcp://a:1", {})
+        cluster.connect("tcp://a:1", {})

@@ -14,7 +14,7 @@ from tests.helpers import ROOT, SHORT_CHAIN, tree
 def refused(folder, **options):
     """Whether the folder is in use."""
     try:
-        with store.in_use(folder, **options):
+        with store.lock_folder(folder, **options):
             return False
     except store.InUseError:
         return True
@@ -24,7 +24,7 @@ def refused(folder, **options):
 @pytest.mark.parametrize("second", [False, True])
 def test_folder_has_one_exclusive_writer_or_several_shared_writers(tmp_path, first, second):
     folder = tmp_path / "new" / "out"
-    with store.in_use(folder, shared=first):
+    with store.lock_folder(folder, shared=first):
         assert refused(folder, shared=second) is not (first and second)
         assert refused(tmp_path / "new" / "other") is False
         (tmp_path / "link").symlink_to(folder)
@@ -35,8 +35,8 @@ def test_folder_has_one_exclusive_writer_or_several_shared_writers(tmp_path, fir
 
 
 def test_the_last_of_several_writers_removes_the_lock_file(tmp_path):
-    with store.in_use(tmp_path / "out", shared=True):
-        with store.in_use(tmp_path / "out", shared=True):
+    with store.lock_folder(tmp_path / "out", shared=True):
+        with store.lock_folder(tmp_path / "out", shared=True):
             pass
         assert refused(tmp_path / "out")
     assert list(tmp_path.iterdir()) == []
@@ -52,8 +52,8 @@ def fill(making):
     time.sleep(60.0)
 
 folder = Path("a[b]")
-with store.in_use(folder):
-    store.write(folder, fill)
+with store.lock_folder(folder):
+    store.write_folder(folder, fill)
 """
 
 
@@ -78,8 +78,8 @@ def test_a_temporary_folder_stays_while_another_process_shares_the_lock(tmp_path
         assert not refused(folder, shared=True)
         (making / "a").write_text("kept")
 
-    with store.in_use(folder, shared=True):
-        store.write(folder, fill)
+    with store.lock_folder(folder, shared=True):
+        store.write_folder(folder, fill)
     assert tree(folder) == {"a": b"kept"}
 
 
@@ -98,15 +98,15 @@ def test_a_lock_file_inside_the_folder_does_not_count_as_its_content(tmp_path, m
     folder = tmp_path / "out"
     folder.mkdir()
     monkeypatch.setattr(type(tmp_path), "is_mount", lambda path: path == folder)
-    with store.in_use(folder, force=False):
+    with store.lock_folder(folder, force=False):
         assert len(list(folder.iterdir())) == 1
         assert refused(folder)
-        store.check(folder, force=False)
+        store.check_folder(folder, force=False)
         assert store.is_empty(folder)
         (folder / "a").touch()
         assert not store.is_empty(folder)
     assert [path.name for path in folder.iterdir()] == ["a"]
-    with pytest.raises(store.RefusedError, match="holds something already"), store.in_use(folder, force=False):
+    with pytest.raises(store.RefusedError, match="holds something already"), store.lock_folder(folder, force=False):
         pass
 
 
@@ -132,7 +132,7 @@ SCENARIO = ("s.toml", "--quiet", "--no-figures")
 def test_commands_do_not_write_into_a_folder_in_use(command, tmp_path, asked):
     (tmp_path / "s.toml").write_text(SHORT_CHAIN)
     before = tree(tmp_path)
-    with store.in_use(tmp_path / "out"):
+    with store.lock_folder(tmp_path / "out"):
         code, said, error = command(*asked, "--out", "out")
         assert (code, said, error.count("\n")) == (2, "", 1)
         assert error.startswith("ptsmc: out is in use by another ptsmc process")
@@ -143,7 +143,7 @@ def test_shards_of_one_folder_run_at_the_same_time(command, tmp_path, monkeypatc
     monkeypatch.setattr(campaign, "PART", 100)
     (tmp_path / "s.toml").write_text(SHORT_CHAIN)
     asked = ("montecarlo", *SCENARIO, "--trials", 110, "--out", "out")
-    with store.in_use(tmp_path / "out", shared=True):
+    with store.lock_folder(tmp_path / "out", shared=True):
         assert command(*asked, "--shard", "1/2") == command(*asked, "--shard", "2/2") == (0, "", "")
         assert command("summarize", "out", "--quiet", "--no-figures") == (0, "", "")
         assert command(*asked)[0] == 2
@@ -156,7 +156,7 @@ def test_a_campaign_in_use_is_summarised_without_writing(command, tmp_path):
     _, printed, _ = command("summarize", "out", "--no-figures")
     (tmp_path / "out" / "summary.json").unlink()
     before = tree(tmp_path / "out")
-    with store.in_use(tmp_path / "out"):
+    with store.lock_folder(tmp_path / "out"):
         code, said, error = command("summarize", "out", "--no-figures")
     assert (code, said) == (0, printed)
     assert "is in use" in error

@@ -67,7 +67,7 @@ def test_worst_margins_are_the_smallest_and_the_largest_peak_sensitivity(xp):
     expected = {"gain_margin": 6.5, "phase_margin": 40.0, "delay_margin": 0.1, "peak_sensitivity": 4.0}
     assert {name: float(v) for name, v in some.worst().items()} == expected
     unstable = some._replace(stable=xp.asarray([False, True]))
-    assert float(unstable.worst()["peak_sensitivity"]) == margins.MOST
+    assert float(unstable.worst()["peak_sensitivity"]) == margins.LARGEST_MARGIN
 
 
 @pytest.mark.parametrize(
@@ -106,7 +106,7 @@ def test_verdict_on_many_loops_uses_the_smallest_margin():
 )
 def test_loops_differ_if_a_dispersion_affects_them(dispersion, differ):
     made = scenario.from_tables({**BODY, "dispersion": dispersion})
-    assert margin_verdicts.differ(scenario.study(made).dispersion) == differ
+    assert margin_verdicts.has_different_loops(scenario.study(made).dispersion) == differ
 
 
 TRIALS = 6  # trials with margins: two at a time on each device, so that the last call is not full
@@ -118,7 +118,7 @@ def _few_loops():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(margin_verdicts, "TRIALS", TRIALS)
         patch.setattr(margin_verdicts, "LOOPS_PER_CALL", 2)
-        patch.setattr(margin_verdicts, "JUDGED", JUDGED)
+        patch.setattr(margin_verdicts, "EXACT_PER_CALL", JUDGED)
         patch.setattr(margin_rows, "CASES", 2)
         yield
 
@@ -139,7 +139,7 @@ def all_of(parts, dispersion, seed, late=False):
     each = [margins.compute_each(jax.tree.map(lambda v, k=k: v[k], loops), with_delay=late) for k in range(TRIALS)]
     if not late:
         each = [one._replace(delay=np.deg2rad(one.phase) / one.crossover) for one in each]
-    return {name: np.stack([farthest(name, one.each()[name], 1) for one in each]) for name in catalogues.MARGINS}
+    return {name: np.stack([farthest(name, one.by_name()[name], 1) for one in each]) for name in catalogues.MARGINS}
 
 
 def worst_of(each):
@@ -149,7 +149,10 @@ def worst_of(each):
 
 def sloped(asked, bounds, normalised):
     """Return the constraints and their gradients at one point."""
-    return {name: v[0] for name, v in margin_rows.of_points(asked, bounds.scale, np.asarray(normalised)[None]).items()}
+    return {
+        name: v[0]
+        for name, v in margin_rows.constraints_at_points(asked, bounds.scale, np.asarray(normalised)[None]).items()
+    }
 
 
 def farthest(name, values, axis):
@@ -195,7 +198,7 @@ DRAWN = {
 def posed_of(plant):
     """Return the tuning problem of this plant with its dispersions."""
     tables = DRAWN[plant]
-    return posing.tuning_problem(
+    return posing.set_up_tuning(
         scenario.from_tables({**tables, "requirements": {**tables["requirements"], "peak_torque": 5.0}}), 3
     )
 
@@ -216,12 +219,12 @@ def test_margin_constraints_agree_with_verdicts_and_finite_differences(drawn):
     )
     assert asked is not None
     found = sloped(asked, bounds, normalised)
-    verdicts = margin_verdicts.of_trials(posed.ready, 3)
+    verdicts = margin_verdicts.judge_trials(posed.ready, 3)
     for row, verdict in zip(np.asarray(found["c"]), verdicts, strict=True):
         np.testing.assert_allclose(row.max() + 1.0, verdict.margin, rtol=1e-9)
     step, along = 1e-4, np.array([0.6, -0.9, 1.0, 0.7])
     points = [normalised + k * step * along for k in (-2, -1, 1, 2)]
-    c = margin_rows.of_points(asked, bounds.scale, np.stack(points[:3]))["c"]  # one point more than devices
+    c = margin_rows.constraints_at_points(asked, bounds.scale, np.stack(points[:3]))["c"]  # one point more than devices
     c = [*c, sloped(asked, bounds, points[3])["c"]]
     numeric = (c[0] - 8 * c[1] + 8 * c[2] - c[3]) / (12 * step)
     slopes = np.asarray(found["c_gradient"])
@@ -242,12 +245,13 @@ def test_margin_gradients_with_dispersed_inertia_compile_if_delta_is_free():
     code = (
         "from ptsmc_jax.configure import configure; configure(1)\n"
         "import numpy as np; from ptsmc_jax import scenario\n"
-        "from tuning.search import margin_rows; from tuning.search.normalisation import of_scenario\n"
+        "from tuning.search import margin_rows; from tuning.search.normalisation import bounds_of_scenario\n"
         f"known = scenario.replace(scenario.read({str(FIRST_FLIGHT)!r}), **{changes!r})\n"
-        "margin_rows.hardest = lambda asked, _: (margin_rows._of_trials(asked, np.arange(2)), 0.0)\n"
-        "ready = scenario.study(known); bounds = of_scenario(known, ready.parts)\n"
-        "asked = margin_rows.ask(ready, bounds, 0)\n"
-        "print(margin_rows.of_points(asked, bounds.scale, np.full((1, len(bounds.names)), 0.5))['c_gradient'].shape)"
+        "margin_rows.select_hardest_trials = lambda asked, _: (margin_rows._with_trials(asked, np.arange(2)), 0.0)\n"
+        "ready = scenario.study(known); bounds = bounds_of_scenario(known, ready.parts)\n"
+        "asked = margin_rows.build_required_margins(ready, bounds, 0)\n"
+        "found = margin_rows.constraints_at_points(asked, bounds.scale, np.full((1, len(bounds.names)), 0.5))\n"
+        "print(found['c_gradient'].shape)"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (0, "(1, 1, 30, 6)\n"), done.stderr[-2000:]
@@ -258,10 +262,10 @@ def test_evaluator_appends_margins_of_the_hardest_trials(drawn, monkeypatch):
     assert posed.problem.rows == ("peak_torque", "gain_margin", "peak_sensitivity")
     normalised = posed.evaluate.bounds.normalise(posed.scenario_gains)[None]
     simulated = {"gains": normalised, "f": np.zeros(1), "c": np.array([[[-0.3, -0.2, -0.4]]]), "value": np.zeros(1)}
-    monkeypatch.setattr(posed.evaluate, "_metrics", lambda *_: dict(simulated))
+    monkeypatch.setattr(posed.evaluate, "_judge", lambda *_: dict(simulated))
     c = posed.evaluate.measure(posed.problem, normalised).c[0]
     assert c[0].tolist() == [-0.3, -0.2, -0.4] + [-1.0] * (c.shape[1] - 3)  # padded to the length of margin rows
-    verdicts = margin_verdicts.of_trials(posed.ready, 3)
+    verdicts = margin_verdicts.judge_trials(posed.ready, 3)
     assert [v.trials for v in verdicts] == [TRIALS, TRIALS]
     # the two hardest trials contain the worst margins of all trials
     for row, verdict in zip(c[1:], verdicts, strict=True):
@@ -274,7 +278,7 @@ def test_evaluator_appends_margins_of_the_hardest_trials(drawn, monkeypatch):
     other = posed.scenario_gains * np.asarray([1.0, 0.2, 1.0, 1.0])  # a slow observer
     parts = with_gains(asked.parts, dict(zip(asked.names, other, strict=True)))
     each = worst_of(all_of(parts, asked.dispersion, 3))
-    harder, near = margin_rows.hardest(asked, other)
+    harder, near = margin_rows.select_hardest_trials(asked, other)
     bounds = posed.evaluate.bounds
     row = sloped(harder, bounds, bounds.normalise(other))["c"]
     np.testing.assert_allclose(row.max() + 1.0, near, rtol=1e-9)
@@ -286,10 +290,10 @@ def test_evaluator_appends_margins_of_the_hardest_trials(drawn, monkeypatch):
 def test_prepared_margin_program_is_the_program_of_the_search(drawn, monkeypatch):
     """A program with other shapes or types would be compiled in vain."""
     posed, prepared = drawn, []
-    monkeypatch.setattr(margin_rows.rows_with_derivatives, "prepare", lambda *given: prepared.append(given))
-    monkeypatch.setattr(margin_rows, "hardest", lambda asked, _: (asked, 0.0))
+    monkeypatch.setattr(margin_rows.constraints_on_devices, "prepare", lambda *given: prepared.append(given))
+    monkeypatch.setattr(margin_rows, "select_hardest_trials", lambda asked, _: (asked, 0.0))
     bounds = posed.evaluate.bounds
-    margin_rows.ask(posed.ready, bounds, 3)
+    margin_rows.build_required_margins(posed.ready, bounds, 3)
     known = [(jax.tree.structure(given), [jax.typeof(leaf) for leaf in jax.tree.leaves(given)]) for given in prepared]
     asked = (
         posed.problem.margins,
@@ -306,7 +310,7 @@ def test_prepared_margin_program_is_the_program_of_the_search(drawn, monkeypatch
             margin_verdicts,
             "_loops_and_margins",
             margin_verdicts.prepare,
-            lambda ready: margin_verdicts.of_trials(ready, 3),
+            lambda ready: margin_verdicts.judge_trials(ready, 3),
         ),
         (rollout, "simulate_once", runs.prepare, lambda ready: runs.rms_lower_bound(ready, 3)),
     ],
@@ -360,7 +364,7 @@ def test_worst_margins_are_exact_without_exact_margins_of_all_loops(drawn, facto
         monkeypatch.setattr(margin_verdicts, "ASSUMED_ERROR", known)
         for names in (list(limits), ["phase_margin", list(limits)[2]], ["phase_margin"]):
             asked = {name: limits[name] for name in names}
-            found = margin_verdicts.worst(parts, dispersion, 3, np.arange(TRIALS), asked, places=2)
+            found = margin_verdicts.worst_margins(parts, dispersion, 3, np.arange(TRIALS), asked, places=2)
             ratio = margin_verdicts.signed_violation_ratio
             near = [np.max([ratio(one[n], limits[n], n) for n in names], 0) for one in (each, found)]
             first = [np.argsort(-v, kind="stable")[:2] for v in near]
@@ -395,13 +399,13 @@ def test_assumed_error_of_delay_margins_is_a_fraction_of_a_period(monkeypatch, p
     def of_each(loops, with_delay):
         assert with_delay
         seen.update(loops.number.tolist())
-        return SimpleNamespace(each=lambda: {"delay_margin": delays[loops.number][:, None]})
+        return SimpleNamespace(by_name=lambda: {"delay_margin": delays[loops.number][:, None]})
 
     monkeypatch.setattr(margin_verdicts, "_loops_and_margins", looked)
-    monkeypatch.setattr(margin_verdicts, "JUDGED", 16)
+    monkeypatch.setattr(margin_verdicts, "EXACT_PER_CALL", 16)
     monkeypatch.setattr(margin_verdicts.margins, "compute_each", of_each)
     nothing: Any = None
-    found = margin_verdicts.worst(nothing, nothing, 3, np.arange(32), {"delay_margin": limit})
+    found = margin_verdicts.worst_margins(nothing, nothing, 3, np.arange(32), {"delay_margin": limit})
     np.testing.assert_array_equal(found["delay_margin"], delays)
     assert seen == judged
 
@@ -418,7 +422,7 @@ def test_campaign_without_its_margin_verdicts_is_unfinished(command, tmp_path, m
     tables = {**untuned(SHORT_CHAIN), "requirements": {"peak_torque": 50.0, "gain_margin": 0.1}}
     if not of_loops:
         told = Requirement("gain_margin", 0.1, "dB", at_least=True).verdict(np.asarray(7.0), np.asarray(True))
-        monkeypatch.setattr(margin_verdicts, "of_trials", lambda *_: [told])
+        monkeypatch.setattr(margin_verdicts, "judge_trials", lambda *_: [told])
         monkeypatch.setattr(margin_verdicts, "prepare", lambda *_: None)
     store.write_toml(tmp_path / "s.toml", tables)
     again, folder = ("montecarlo", "s.toml", "--trials", 2, "--no-figures"), tmp_path / "out" / "montecarlo-s"

@@ -7,7 +7,7 @@ import pytest
 
 from ptsmc_jax.campaigns import campaign, rows
 
-KEY = rows.key_of({"loop": {"period": 0.1}}, {"seed": 1})
+KEY = rows.campaign_key({"loop": {"period": 0.1}}, {"seed": 1})
 
 
 def frame(first, count):
@@ -42,7 +42,7 @@ def test_damaged_part_is_detected(kept, harm):
         harmed.path.rename(harmed.path.with_name("0000000060-0000000109" + harmed.path.name[21:]))
     if harm == "foreign":
         harmed.path.unlink()
-        other = rows.Rows(kept.folder, rows.key_of({"loop": {"period": 0.1}}, {"seed": 2}))
+        other = rows.Rows(kept.folder, rows.campaign_key({"loop": {"period": 0.1}}, {"seed": 2}))
         other.write(50, frame(50, 50))
     parts, broken = kept.parts()
     assert parts == [whole]
@@ -98,9 +98,9 @@ def test_part_that_does_not_fit_on_the_disk_leaves_no_file(kept, monkeypatch):
 
 
 def test_different_campaigns_have_different_keys():
-    assert rows.key_of({"a": {"b": 1}}, {"seed": 1}) == rows.key_of({"a": {"b": 1}}, {"seed": 1})
+    assert rows.campaign_key({"a": {"b": 1}}, {"seed": 1}) == rows.campaign_key({"a": {"b": 1}}, {"seed": 1})
     others = [({"a": {"b": 2}}, {"seed": 1}), ({"a": {"b": 1}}, {"seed": 2}), ({"a": {"b": 1}}, {"seed": 1, "m": "x"})]
-    assert len({rows.key_of(*o) for o in others} | {rows.key_of({"a": {"b": 1}}, {"seed": 1})}) == 4
+    assert len({rows.campaign_key(*o) for o in others} | {rows.campaign_key({"a": {"b": 1}}, {"seed": 1})}) == 4
 
 
 def test_a_key_is_the_same_in_every_process():
@@ -121,5 +121,5 @@ def test_folder_with_wildcards_in_its_name_is_read_alone(tmp_path, name):
         kept.write(0, frame(0, 50).with_columns(status=pl.lit("ok" if folder == name else "diverged")))
     parts, _ = rows.Rows(tmp_path / name, KEY).parts()
     assert rows.read(parts)["trial"].to_list() == list(range(50))
-    assert rows.columns_of(parts[0]) == ["trial", "x", "status"]
-    assert campaign.tally(parts, 50) == campaign.Tally(done=50, total=50, failed=0)
+    assert rows.column_names(parts[0]) == ["trial", "x", "status"]
+    assert campaign.count_progress(parts, 50) == campaign.Tally(done=50, total=50, failed=0)

@@ -81,7 +81,7 @@ def of_a_chain():
 
 
 def of_run_table(made, table):
-    return campaign.of_run_table(made.ready, made.seed, run_tables.checked(table, made.ready.parts))
+    return campaign.from_run_table(made.ready, made.seed, run_tables.check_table(table, made.ready.parts))
 
 
 # the spacecraft is a long test, because a later test checks that its run table has the exact inputs
@@ -94,7 +94,7 @@ def test_campaign_of_a_written_run_table_has_identical_rows(which, request, tmp_
     checksums = set()
     for name in ("run_table.csv", "run_table.parquet"):
         again = of_run_table(made, run_tables.read(tmp_path / name))
-        checksums.add(run_tables.checked(run_tables.read(tmp_path / name), made.ready.parts).checksum)
+        checksums.add(run_tables.check_table(run_tables.read(tmp_path / name), made.ready.parts).checksum)
         assert again.run_table is not None
         assert not again.run_table.given  # the program of the original campaign simulates it
         assert_frame_equal(again.simulate(range(TRIALS)), frame, check_exact=True)
@@ -151,8 +151,8 @@ def test_other_values_of_a_custom_dispersion_are_refused():
     written = campaign.Campaign(ready, SEED).draw(range(5))
 
     def again(table):
-        return campaign.of_run_table(
-            ready, SEED, run_tables.checked(table, ready.parts, drawn=ready.dispersion.custom_names())
+        return campaign.from_run_table(
+            ready, SEED, run_tables.check_table(table, ready.parts, drawn=ready.dispersion.custom_names())
         )
 
     assert_frame_equal(again(written).draw(range(5)), written, check_exact=True)
@@ -370,7 +370,7 @@ BAD = [
 @pytest.mark.parametrize(("columns", "said"), BAD, ids=[row[1][:50] for row in BAD])
 def test_invalid_values_are_refused_with_row_and_column(everything, columns, said):
     with refuses(RefusedError, said):
-        run_tables.checked(pl.DataFrame(columns, strict=False), everything[0].ready.parts)
+        run_tables.check_table(pl.DataFrame(columns, strict=False), everything[0].ready.parts)
 
 
 HARDWARE = """
@@ -421,14 +421,14 @@ def table_of(columns, rows):
 @pytest.mark.parametrize(("columns", "rows", "said"), MISFIT, ids=[row[2][-60:] for row in MISFIT])
 def test_impossible_hardware_is_refused_with_row_and_column(misfit, columns, rows, said):
     with refuses(RefusedError, said):
-        run_tables.checked(table_of(columns, rows), misfit)
+        run_tables.check_table(table_of(columns, rows), misfit)
 
 
 def test_limiting_cases_of_hardware_are_accepted(misfit):
     """Outages of zero length, wheel 0 (no failure), the last wheel, and a coupling that needs the row's inertia."""
     heavy = (20.0, 0.0, 0.0, 20.0, 0.0, 20.0)
     rows = [(-1.0, -1.0, 2.0, 0.0, 4.0, 0.0, 0.0, *heavy), (3.0, 3.0, 2.0, 4.0, 0.0, 0.0, 4.4, *heavy)]
-    run_table = run_tables.checked(table_of([*OUTAGE, *FAILURE, *COUPLING, *J], rows), misfit)
+    run_table = run_tables.check_table(table_of([*OUTAGE, *FAILURE, *COUPLING, *J], rows), misfit)
     assert [list(values[1]) for values in run_table.given.values()] == [[3, 3], [2, 4], [0, 0, 4.4], list(heavy)]
 
 

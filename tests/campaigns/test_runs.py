@@ -26,8 +26,8 @@ def test_lower_bound_is_pooled_over_the_first_trials_or_rows(monkeypatch, varies
     def along_each(simulated):
         return [lower_bound.LowerBound(bound, np.zeros(1), np.zeros(1)) for bound, _ in simulated]
 
-    monkeypatch.setattr(runs, "_simulate", fly)
-    monkeypatch.setattr(lower_bound, "along_each", along_each)
+    monkeypatch.setattr(runs, "_simulate_without_margins", fly)
+    monkeypatch.setattr(lower_bound, "bounds_along_runs", along_each)
     ready: Any = SimpleNamespace(dispersion=SimpleNamespace(varies=varies))
     squares = [(1.0 + (k or 0)) ** 2 for j, k in enumerate(simulated) if j != 1]
     assert runs.rms_lower_bound(ready, 5, rows) == pytest.approx(math.sqrt(sum(squares) / len(squares)))

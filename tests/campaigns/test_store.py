@@ -25,7 +25,7 @@ def test_writing_into_an_existing_folder_replaces_only_what_is_written(tmp_path)
         (folder / "figures").mkdir()
         (folder / "figures" / "a.png").write_text("new")
 
-    store.write(tmp_path / "out", fill)
+    store.write_folder(tmp_path / "out", fill)
     assert (tmp_path / "out" / "mine.txt").read_text() == "keep"
     assert (tmp_path / "out" / "figures" / "a.png").read_text() == "new"
 
@@ -46,16 +46,16 @@ def test_files_of_an_earlier_result_are_removed_and_the_summary_is_written_last(
 
     out, others = tmp_path / "out", ("mine.txt", "figures/mine.csv", "figures/mine.png")
     made = [name for name in store.MADE_OF_RESULTS if "*" not in name]
-    store.write(out, result("first", "tuned.toml", "figures/a.png", "figures/b.png"))
+    store.write_folder(out, result("first", "tuned.toml", "figures/a.png", "figures/b.png"))
     for name in others:
         (out / name).write_text("kept")
     for name in made:
         (out / name).write_bytes(store.MADE_OF_RESULTS[name])
     before = tree(out)
-    store.write(out, result("first", "tuned.toml"))  # same result, without figures
+    store.write_folder(out, result("first", "tuned.toml"))  # same result, without figures
     assert tree(out) == before
     moved.clear()
-    store.write(out, result("second", "versions.json", "tuned.toml", "figures/b.png"))
+    store.write_folder(out, result("second", "versions.json", "tuned.toml", "figures/b.png"))
     assert set(tree(out)) == {
         "mine.txt", "figures/mine.csv", "figures/mine.png", "figures/b.png", "tuned.toml", "versions.json",
         "summary.json",
@@ -63,11 +63,11 @@ def test_files_of_an_earlier_result_are_removed_and_the_summary_is_written_last(
     assert (moved[0], moved[-1]) == ("versions.json", "summary.json")
     for name in made:
         (out / name).write_text("a user's own")
-    store.write(out, result("third"))
+    store.write_folder(out, result("third"))
     assert [(out / name).read_text() for name in made] == ["a user's own"] * 3
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "report.html").write_bytes(store.MADE_OF_RESULTS["report.html"])  # the folder has no result
-    store.write(tmp_path / "mine", result("third"))
+    store.write_folder(tmp_path / "mine", result("third"))
     assert (tmp_path / "mine" / "report.html").exists()
 
 
@@ -84,10 +84,10 @@ def test_result_without_a_summary_replaces_an_earlier_result(tmp_path, changed):
     (out / "figures").mkdir(parents=True)
     (out / "figures" / "map.png").write_bytes(store.MADE_OF_RESULTS["figures/*.png"])
     a_map(out)
-    store.write(out, a_map)  # same result from another command line, without figures
+    store.write_folder(out, a_map)  # same result from another command line, without figures
     assert (out / "figures" / "map.png").exists()
     (out / "summary.json").write_text("{}")
-    store.write(out, lambda folder: a_map(folder, changed))
+    store.write_folder(out, lambda folder: a_map(folder, changed))
     assert not (out / "figures" / "map.png").exists()
     assert not (out / "summary.json").exists()
 
@@ -98,30 +98,30 @@ TOLD = {"command": "tune", "seed": 5}
 def test_earlier_result_needs_the_same_scenario_seed_and_command(tmp_path):
     tables, folder = {"controller": {"eta": 3.0, "gain": [1.0, 2.0]}}, tmp_path / "out"
     finished(folder, tables)
-    assert store.previous(folder, tables, TOLD) == {"status": "met"}
-    assert store.previous(folder, tables, {**TOLD, "seed": 6}) is None
-    assert store.previous(folder, tables, {**TOLD, "command": "simulate"}) is None
+    assert store.read_previous_summary(folder, tables, TOLD) == {"status": "met"}
+    assert store.read_previous_summary(folder, tables, {**TOLD, "seed": 6}) is None
+    assert store.read_previous_summary(folder, tables, {**TOLD, "command": "simulate"}) is None
     for other in (
         {},
         {"controller": {"eta": 3.0000000000000004, "gain": [1.0, 2.0]}},
         {"controller": {**tables["controller"], "delta": 0.05}},
         {**tables, "loop": {"t_end": 40.0}},
     ):
-        assert store.previous(folder, other, TOLD) is None
-    assert store.previous(tmp_path / "none", tables, TOLD) is None
+        assert store.read_previous_summary(folder, other, TOLD) is None
+    assert store.read_previous_summary(tmp_path / "none", tables, TOLD) is None
 
 
 def test_unfinished_run_with_a_list_of_sensors_resumes(tmp_path):
     sensors = [{"kind": "star_tracker", "period": 0.25}, {"kind": "gyro"}]
     tables, folder = {"loop": {"period": 0.125}, "sensors": sensors}, tmp_path / "out"
-    store.begin(folder, tables, TOLD, fresh=True)
-    assert store.begun(folder, tables, TOLD)
+    store.begin_run(folder, tables, TOLD, fresh=True)
+    assert store.has_unfinished_run(folder, tables, TOLD)
     slower = {**tables, "sensors": [{**sensors[0], "period": 0.5}, sensors[1]]}
     with pytest.raises(store.RefusedError, match=re.escape("sensors[0].period is 0.25 there, and 0.5 here")):
-        store.begun(folder, slower, TOLD)
+        store.has_unfinished_run(folder, slower, TOLD)
     for other in (sensors[:1], [], {"kind": "custom"}):
         with pytest.raises(store.RefusedError, match="another scenario: sensors"):
-            store.begun(folder, {**tables, "sensors": other}, TOLD)
+            store.has_unfinished_run(folder, {**tables, "sensors": other}, TOLD)
 
 
 def fill(folder):
@@ -138,7 +138,7 @@ def test_write_creates_only_the_folder_with_the_mode_of_the_umask(tmp_path, befo
     try:
         if before == "an empty folder":
             folder.mkdir()
-        store.write(folder, fill)
+        store.write_folder(folder, fill)
     finally:
         os.umask(earlier)
     assert tree(folder) == {"figures/a.png": b"new", "summary.json": b"new"}
@@ -158,9 +158,9 @@ def test_links_and_mount_points_are_written_on_their_own_disk(tmp_path, monkeypa
         (tmp_path / name).mkdir()
     (tmp_path / "links" / "out").symlink_to(tmp_path / "elsewhere" / "out")
     for _ in range(2):  # the target of the link exists only the second time
-        store.write(tmp_path / "links" / "out", note)
+        store.write_folder(tmp_path / "links" / "out", note)
     monkeypatch.setattr(type(tmp_path), "is_mount", lambda path: path == mounted)
-    store.write(mounted, note)
+    store.write_folder(mounted, note)
     assert made == [tmp_path / "elsewhere", tmp_path / "elsewhere", mounted]
     written = {"figures/a.png": b"new", "summary.json": b"new"}
     assert tree(tmp_path / "elsewhere" / "out") == tree(mounted) == written
@@ -170,14 +170,14 @@ def test_links_and_mount_points_are_written_on_their_own_disk(tmp_path, monkeypa
 def test_folder_is_written_if_its_parent_is_not_writable(tmp_path, monkeypatch):
     (tmp_path / "out").mkdir()
     monkeypatch.setattr(store.os, "access", lambda path, _: path == tmp_path / "out")
-    store.check(tmp_path / "out", force=False)
-    store.write(tmp_path / "out", lambda folder: fill(folder) if folder.parent == tmp_path / "out" else None)
+    store.check_folder(tmp_path / "out", force=False)
+    store.write_folder(tmp_path / "out", lambda folder: fill(folder) if folder.parent == tmp_path / "out" else None)
     assert tree(tmp_path / "out") == {"figures/a.png": b"new", "summary.json": b"new"}
     refused = pytest.raises(
         store.RefusedError, match=f"--out is .*new, but nothing may be written into {tmp_path}; allowed"
     )
     with refused:
-        store.check(tmp_path / "new", force=False)
+        store.check_folder(tmp_path / "new", force=False)
 
 
 def test_failed_write_keeps_the_existing_file(tmp_path):
@@ -212,7 +212,7 @@ def test_run_that_cannot_begin_on_a_full_disk_leaves_no_files(tmp_path, monkeypa
     monkeypatch.setattr(store, "write_json", full)  # after scenario.toml
     for name in ("old", "new"):
         with pytest.raises(OSError, match="No space left"):
-            store.begin(tmp_path / name, tables, TOLD, fresh=True)
+            store.begin_run(tmp_path / name, tables, TOLD, fresh=True)
     assert tree(tmp_path) == before
     assert [path.name for path in tmp_path.iterdir()] == ["old"]
 
@@ -227,7 +227,7 @@ def test_interrupted_write_changes_nothing(tmp_path, stop):
     (tmp_path / "old" / "summary.json").write_text("before")
     for name in ("new", "old"):
         with pytest.raises(stop):
-            store.write(tmp_path / name, stopped)
+            store.write_folder(tmp_path / name, stopped)
     assert tree(tmp_path) == {"old/summary.json": b"before"}
     assert [p.name for p in tmp_path.iterdir()] == ["old"]
 
@@ -235,18 +235,18 @@ def test_interrupted_write_changes_nothing(tmp_path, stop):
 def test_check_reports_the_folder_and_the_allowed_values(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(store.RefusedError) as caught:
-        store.check(tmp_path / "file", force=False)
+        store.check_folder(tmp_path / "file", force=False)
     assert str(caught.value) == f"--out is {tmp_path / 'file'}, which is a file; allowed is a new folder"
     with pytest.raises(store.RefusedError) as caught:
-        store.check(tmp_path, force=False)
+        store.check_folder(tmp_path, force=False)
     assert str(caught.value).startswith(f"--out is {tmp_path}, which holds something already; allowed is a new folder")
     for file in ("file", "file/out"):  # a folder cannot be made below a file
         with pytest.raises(store.RefusedError, match="file"):
-            store.check(tmp_path / file, force=True)
-    store.check(tmp_path, force=True)
-    store.check(tmp_path / "new", force=False)
+            store.check_folder(tmp_path / file, force=True)
+    store.check_folder(tmp_path, force=True)
+    store.check_folder(tmp_path / "new", force=False)
     (tmp_path / "empty").mkdir()
-    store.check(tmp_path / "empty", force=False)
+    store.check_folder(tmp_path / "empty", force=False)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
@@ -307,9 +307,9 @@ def finished(folder, tables):
 def test_folder_with_a_missing_or_broken_file_has_no_earlier_result(tmp_path, name, content):
     tables = {"controller": {"eta": 3.0, "bounds": {"eta": (2.5, 3.5)}}}
     finished(tmp_path / "out", tables)
-    assert store.previous(tmp_path / "out", tables, TOLD) == {"status": "met"}
+    assert store.read_previous_summary(tmp_path / "out", tables, TOLD) == {"status": "met"}
     (tmp_path / "out" / name).unlink() if content is None else (tmp_path / "out" / name).write_text(content)
-    assert store.previous(tmp_path / "out", tables, TOLD) is None
+    assert store.read_previous_summary(tmp_path / "out", tables, TOLD) is None
 
 
 def test_versions_describe_command_code_and_platform(monkeypatch):
@@ -327,33 +327,33 @@ def test_versions_describe_command_code_and_platform(monkeypatch):
 
 def test_unfinished_run_resumes_only_with_the_same_command(tmp_path):
     tables, folder = {"controller": {"eta": 3.0}}, tmp_path / "new"
-    assert not store.begun(folder, tables, TOLD)
-    journal = store.begin(folder, tables, TOLD, fresh=True)
+    assert not store.has_unfinished_run(folder, tables, TOLD)
+    journal = store.begin_run(folder, tables, TOLD, fresh=True)
     journal.write_bytes(b"kept")
-    assert store.begun(folder, tables, TOLD)
+    assert store.has_unfinished_run(folder, tables, TOLD)
     for other, asked, said in (
         (tables, {**TOLD, "seed": 6}, "a run with seed 5, not 6"),
         (tables, {**TOLD, "command": "pareto"}, "a run with command tune, not pareto"),
         ({"controller": {"eta": 3.1}}, TOLD, "eta is 3.0 there, and 3.1 here"),
     ):
         with pytest.raises(store.RefusedError, match=said):
-            store.begun(folder, other, asked)
-    assert store.previous(folder, tables, TOLD) is None
-    assert store.begin(folder, tables, TOLD, fresh=False).read_bytes() == b"kept"
+            store.has_unfinished_run(folder, other, asked)
+    assert store.read_previous_summary(folder, tables, TOLD) is None
+    assert store.begin_run(folder, tables, TOLD, fresh=False).read_bytes() == b"kept"
     (folder / "summary.json").write_text('{"status": "interrupted"}')
-    assert store.previous(folder, tables, TOLD) == {"status": "interrupted"}
-    assert store.begin(folder, tables, TOLD, fresh=False)
+    assert store.read_previous_summary(folder, tables, TOLD) == {"status": "interrupted"}
+    assert store.begin_run(folder, tables, TOLD, fresh=False)
     assert (folder / "summary.json").exists()
-    assert store.begin(folder, tables, TOLD, fresh=True).read_bytes() == b""
+    assert store.begin_run(folder, tables, TOLD, fresh=True).read_bytes() == b""
     assert not (folder / "summary.json").exists()  # the summary of another run must not remain
     made = json.loads((folder / "versions.json").read_text())
     for name, said in (("jax", "a run with jax other"), ("code_checksum", "another version of the source code")):
         (folder / "versions.json").write_text(json.dumps({**made, name: "other"}))
         with pytest.raises(store.RefusedError, match=said):  # other versions may have other rounding errors
-            store.begun(folder, tables, TOLD)
+            store.has_unfinished_run(folder, tables, TOLD)
     (folder / "versions.json").write_text(json.dumps({**made, "command_line": "other"}))
-    assert store.begun(folder, tables, TOLD)
+    assert store.has_unfinished_run(folder, tables, TOLD)
     with pytest.raises(store.RefusedError):
-        store.check(folder, force=False)
-    store.end(folder)
-    assert not store.begun(folder, tables, TOLD)
+        store.check_folder(folder, force=False)
+    store.end_run(folder)
+    assert not store.has_unfinished_run(folder, tables, TOLD)

@@ -27,7 +27,7 @@ class Rows:
     path = "rows"
     units = campaign_folder.Folder.units
 
-    def whole_parts(self):
+    def intact_parts(self):
         return [self]
 
 
@@ -38,9 +38,9 @@ def test_inputs_of_the_worst_trial_have_percentile_median_and_sensitivity(monkey
         "trial": np.arange(401), "status": ["ok"] * 401, "peak_torque": angle**2, "initial_angle": angle,
         "initial_q4": np.cos(angle / 2), "initial_w1": rate, "always": np.ones(401),
     })  # fmt: skip
-    monkeypatch.setattr(campaign_summary.rows, "columns_of", lambda part: list(table.schema))
+    monkeypatch.setattr(campaign_summary.rows, "column_names", lambda part: list(table.schema))
     monkeypatch.setattr(campaign_summary.rows, "read", lambda parts, names: table.select(names))
-    why: Any = inspect.unwrap(reasons.why)  # without the type check, which would refuse `Rows`
+    why: Any = inspect.unwrap(reasons.explain_worst_trials)  # without the type check, which would refuse `Rows`
     told = why(Rows(), ["peak_torque"], 1)
     assert [one["input"] for one in told] == ["initial_angle", "initial_w1"]  # q4 duplicates the angle
     assert told[0] == {"metric": "peak_torque", "trial": 400, "value": 4.0, "input": "initial_angle", "drawn": 2.0,
@@ -48,12 +48,12 @@ def test_inputs_of_the_worst_trial_have_percentile_median_and_sensitivity(monkey
                        "rank_correlation": pytest.approx(1.0, rel=1e-12),
                        "first_order": pytest.approx(1.0, abs=0.05), "trials": 401}  # fmt: skip
     assert told[1]["percentile"] == 100.0 * np.mean(rate <= rate[400])
-    (said,) = trials_report.why(told, "spacecraft")
+    (said,) = trials_report.explanation_lines(told, "spacecraft")
     assert (
         said == "peak_torque 4 N m in trial 400: initial_angle 2 rad at 100.0 % (median 1)"
     )  # the rate has no effect on the torque
     table = table.with_columns(peak_torque=np.random.default_rng(5).permutation(401) / 50.0)
-    (said,) = trials_report.why(why(Rows(), ["peak_torque"], 1), "spacecraft")
+    (said,) = trials_report.explanation_lines(why(Rows(), ["peak_torque"], 1), "spacecraft")
     assert said.endswith("no sampled input explains it; sensor noise remains")
     # the number of a failed wheel is a category without an order; here wheel 2 causes the largest torques
     wheel = np.arange(401) % 4 + 1.0
@@ -63,16 +63,20 @@ def test_inputs_of_the_worst_trial_have_percentile_median_and_sensitivity(monkey
     assert (one["percentile"], one["median"], one["fraction"]) == (None, None, pytest.approx(100 / 401))
     assert one["rank_correlation"] is None
     assert one["first_order"] > 0.5
-    assert "wheel_failure_wheel 2 as in 24.9 % of the trials" in "".join(trials_report.why(told, "spacecraft"))
+    assert "wheel_failure_wheel 2 as in 24.9 % of the trials" in "".join(
+        trials_report.explanation_lines(told, "spacecraft")
+    )
     drivers = {"peak_torque": statistics.drivers({"wheel_failure_wheel": wheel, "initial_w1": rate},
                                                  table["peak_torque"].to_numpy(), categories=CATEGORIES)}  # fmt: skip
     found = examples.campaign(verdicts=[examples.torque(0.9)], drivers=drivers, driver_trials={"peak_torque": 401})
-    (said,) = campaign_report.drivers(found)
+    (said,) = campaign_report.driver_lines(found)
     assert "wheel_failure_wheel (56 % of the variance of the ranks)" in said
     table = table.with_columns(status=pl.Series(["diverged"] + ["ok"] * 400))
     told = why(Rows(), ["peak_torque"], 1)
     # unusual inputs of a failed trial
-    assert "wheel_failure_wheel 1 as in 25.2 % of the trials" in "".join(trials_report.why(told, "spacecraft"))
+    assert "wheel_failure_wheel 1 as in 25.2 % of the trials" in "".join(
+        trials_report.explanation_lines(told, "spacecraft")
+    )
     # metrics of a failed run are those until its failure; sensitivities must not use them
     cut = np.where(np.arange(401) % 3 == 0, 1e3 * (1.0 - rate), table["peak_torque"].to_numpy())
     table = table.with_columns(
@@ -98,16 +102,16 @@ def test_every_random_input_may_be_a_reason(monkeypatch):
     assert any(name.startswith("disturbance") for name in columns)
     kept = [
         "trial",
-        *run_tables.HEADING,
+        *run_tables.STATUS_COLUMNS,
         *run_tables.OF_ROWS.values(),
         *ready.catalogue,
         *run_tables.SAMPLES,
         *columns,
         "mine",
     ]
-    monkeypatch.setattr(campaign_summary.rows, "columns_of", lambda part: kept)
+    monkeypatch.setattr(campaign_summary.rows, "column_names", lambda part: kept)
     folder: Any = SimpleNamespace(custom_metric_names=["mine"])
-    assert inspect.unwrap(campaign_summary.drawn_columns)(folder, [None]) == columns
+    assert inspect.unwrap(campaign_summary.input_columns)(folder, [None]) == columns
 
 
 def test_dispersion_of_zero_width_is_not_a_reason():

@@ -25,7 +25,7 @@ def test_simulate_writes_an_ephemeris_that_is_a_reference_of_another_run(command
     table = pl.read_csv(tmp_path / "r" / "trajectory.csv")
     text = (tmp_path / "r" / "attitude.aem").read_text()
     assert "START_TIME = 2026-03-20T12:00:00.000000000000" in text
-    found = aem.segment(text)
+    found = aem.read_segment(text)
     assert found.rates is not None
     np.testing.assert_array_equal(found.quaternions, table["q1", "q2", "q3", "q4"].to_numpy())
     np.testing.assert_allclose(found.rates, table["w1", "w2", "w3"].to_numpy(), rtol=1e-14, atol=1e-300)
@@ -33,7 +33,7 @@ def test_simulate_writes_an_ephemeris_that_is_a_reference_of_another_run(command
     for file in ("attitude.aem", "trajectory.csv"):
         tables = tomllib.loads(MULTIPLICATIVE) | {"reference": {"kind": "table", "file": str(tmp_path / "r" / file)}}
         read: Any = scenario.from_tables(tables)
-        np.testing.assert_allclose(read.reference.first(read), found.quaternions[0], atol=1e-12)
+        np.testing.assert_allclose(read.reference.initial_attitude(read), found.quaternions[0], atol=1e-12)
 
 
 def test_an_ephemeris_of_a_chain_is_refused(command, tmp_path):

@@ -53,7 +53,7 @@ PLANTS = {"chain": (SHORT_CHAIN, "3 u"), "spacecraft": (SHORT, "30 N m")}
 def test_montecarlo_writes_rows_summary_and_figures(command, tmp_path, monkeypatch, plant):
     text, limit = PLANTS[plant]
     (tmp_path / "s.toml").write_text(text)
-    monkeypatch.setattr(progress, "EVERY", 0.05)
+    monkeypatch.setattr(progress, "INTERVAL", 0.05)
     code, said, err = command("montecarlo", "s.toml", "--trials", 250, "--seed", 3)
     folder = tmp_path / FOLDER
     assert code == 0
@@ -80,7 +80,7 @@ def test_montecarlo_writes_rows_summary_and_figures(command, tmp_path, monkeypat
     assert 0.0 < least < told["rms"]
     for place in (said, read.text):
         assert f"RMS error {told['rms']:.3g} x1: every requirement is met" in place
-        assert f"{formats.ratio(told['rms'] / least)} times the lower bound of {least:.3g} x1" in place
+        assert f"{formats.format_ratio(told['rms'] / least)} times the lower bound of {least:.3g} x1" in place
     np.testing.assert_allclose([told["mean"], told["rms"], told["max"]],
                                [errors.mean(), np.sqrt(np.mean(errors**2)), errors.max()], rtol=1e-12)  # fmt: skip
     assert told["0.9"]["value"] == np.sort(errors)[224]
@@ -104,10 +104,16 @@ def test_equal_trials_are_reported(command, tmp_path, simulated, drawn, instead)
 def test_failed_trials_are_not_reported_as_equal():
     assert campaign_summary._equal_trials({"window_error": {"without_value": 5}}, 5) == []
     at_rest = {"window_error": {"without_value": 0, "mean": 0.0, "max": 0.0}}
-    (said,) = campaign_summary._equal_trials(at_rest, 5, drawn=True)  # such as a dispersed inertia of a body at rest
+    (said,) = campaign_summary._equal_trials(
+        at_rest, 5, inputs_differ=True
+    )  # such as a dispersed inertia of a body at rest
     assert said == "all 5 trials have the same metrics: the dispersions change no metric"
     at_rest["window_error"]["without_value"] = 4  # only one trial has a value
-    assert campaign_summary._equal_trials(at_rest, 5, drawn=True) == campaign_summary._equal_trials(at_rest, 5) == []
+    assert (
+        campaign_summary._equal_trials(at_rest, 5, inputs_differ=True)
+        == campaign_summary._equal_trials(at_rest, 5)
+        == []
+    )
 
 
 def test_more_trials_extend_an_existing_campaign(command, simulated):
@@ -373,8 +379,8 @@ def test_replay_that_differs_from_its_row_is_reported(command, simulated):
     """The changed row has a valid checksum, as if another version had computed it."""
     from tuning.studies import campaign_folder
 
-    opened = campaign_folder.opened(simulated)
-    first = opened.whole_parts()[0]
+    opened = campaign_folder.open_folder(simulated)
+    first = opened.intact_parts()[0]
     changed = pl.read_parquet(first.path).with_columns(effort=pl.col("effort") * (1 + 1e-9))
     first.path.unlink()
     opened.rows.write(0, changed)

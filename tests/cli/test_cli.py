@@ -46,8 +46,11 @@ def test_simulate_writes_its_result_folder(command, tmp_path):
     assert {name for name, entry in catalogues.CATALOGUE.items() if entry.table is None} <= set(summary)
     assert summary["peak_torque"] == pytest.approx(np.abs(values[:, 11:14]).max(), rel=1e-12)
     first, second, *_ = out.splitlines()
-    assert first == f"pointing error {formats.error(summary['window_error'], 'spacecraft')}: every requirement is met"
-    times = formats.ratio(summary["window_error"] / summary["lower_bound"])
+    assert (
+        first
+        == f"pointing error {formats.format_error(summary['window_error'], 'spacecraft')}: every requirement is met"
+    )
+    times = formats.format_ratio(summary["window_error"] / summary["lower_bound"])
     assert second.startswith(f"{times} times the lower bound of ")
     assert scenario.read(folder / "scenario.toml") == scenario.read(tmp_path / "s.toml")
     made = json.loads((folder / "versions.json").read_text())
@@ -105,7 +108,7 @@ def test_tune_command_writes_results_and_repeats_them(command, tmp_path, monkeyp
     # than the published gains, whose faster surface and observer are not free in this search.
     assert summary["held_out"]["window_error"]["rms"] < summary["before"]["window_error"]["rms"]
 
-    assert summary["trust"]["margins"] == stability.worst(scenario.study(tuned))
+    assert summary["trust"]["margins"] == stability.worst_margins(scenario.study(tuned))
     assert summary["shortest_t_f"]["theory"] > 0.0
 
     read = checked(tmp_path / "t")
@@ -113,7 +116,7 @@ def test_tune_command_writes_results_and_repeats_them(command, tmp_path, monkeyp
     assert f"margins of the nominal loop in the hold phase: gain {left:.3g} dB" in read.text
     assert set(read.charts) == {"search"}
     times = summary["held_out"]["window_error"]["rms"] / summary["held_out"]["lower_bound"]
-    assert f"{formats.ratio(times)} times the lower bound of " in read.text
+    assert f"{formats.format_ratio(times)} times the lower bound of " in read.text
     assert len(read.charts["search"]["data"]) == summary["search"]["starts"]
     gains = ", ".join(f"{name} {value:.6g}" for name, value in summary["gains"].items())
     assert read.text.index(f"gains: {gains}") < read.text.index("Requirements")  # at once, with the verdict
@@ -135,10 +138,14 @@ def test_tune_command_writes_results_and_repeats_them(command, tmp_path, monkeyp
 @pytest.mark.parametrize("others", short([[], ["pd"]], [[]]))
 def test_compare_command_writes_its_results(command, tmp_path, monkeypatch, others):
     small_search(monkeypatch)
-    monkeypatch.setattr(compare, "laws", lambda: [compare.OURS, *others])  # every further law compiles more programs
+    monkeypatch.setattr(
+        compare, "law_kinds", lambda: [compare.OURS, *others]
+    )  # every further law compiles more programs
     model_errors = compare.MODEL_ERRORS if others else ("heavier", "lighter")  # "later" compiles another program too
-    perturbed = compare.perturbed
-    monkeypatch.setattr(compare, "perturbed", lambda one: {name: perturbed(one)[name] for name in model_errors})
+    perturbed = compare.perturbed_scenarios
+    monkeypatch.setattr(
+        compare, "perturbed_scenarios", lambda one: {name: perturbed(one)[name] for name in model_errors}
+    )
     code, said, _ = command("compare", "s.toml")
     folder = tmp_path / "out/compare-s"
     found = json.loads((folder / "summary.json").read_text())
@@ -157,9 +164,9 @@ def test_compare_command_writes_its_results(command, tmp_path, monkeypatch, othe
         assert float(row["window_error"]) == found["laws"][law]["window_error"]
         assert law.split("_")[0] in said
         again = scenario.read(folder / "scenarios" / f"{law}.toml")  # the judged scenario
-        error, _ = judging.window_error(judging.judge(again, found["seed"]))  # simulated again on the same trials
+        error, _ = judging.rms_window_error(judging.judge(again, found["seed"]))  # simulated again on the same trials
         assert error == pytest.approx(found["laws"][law]["window_error"], rel=1e-9)
-        assert found["laws"][law]["margins"] == stability.worst(scenario.study(again))
+        assert found["laws"][law]["margins"] == stability.worst_margins(scenario.study(again))
         assert found["laws"][law]["gains"].keys() >= {"pd": {"k_p", "k_d"}}.get(law, {"eta", "delta"})
         for name, value in found["laws"][law]["gains"].items():
             if name != "observer_gain":
@@ -167,7 +174,7 @@ def test_compare_command_writes_its_results(command, tmp_path, monkeypatch, othe
     read = checked(folder)
     assert read.text.startswith("ptsmc compare: compare-s")
     error = found["laws"][laws[-1]]["window_error"]
-    assert formats.ratio(np.degrees(2 * np.arcsin(error)) * 3600) in read.text
+    assert formats.format_ratio(np.degrees(2 * np.arcsin(error)) * 3600) in read.text
     code, again, _ = command("compare", "s.toml")
     assert "from an earlier run" in again
     assert command("compare", "s.toml", "--seed", "x")[0] == 2
@@ -377,7 +384,7 @@ def test_killed_search_resumes(tmp_path):
     code = (
         "import sys; from tuning.cli import main; "
         "from tuning.search import confirm, evolution, local_searches, starts, worst; "
-        "starts.SWEPT = 16; local_searches.MANY = 16; evolution.GENERATIONS = 3; "
+        "starts.CANDIDATES = 16; local_searches.SOBOL_POINTS = 16; evolution.GENERATIONS = 3; "
         "worst.SCREENED = 48; confirm.HELD_OUT = 40; main.main()"
     )
     run = [sys.executable, "-c", code, "tune", "s.toml", "--out", "t", "--quiet", "--no-figures"]
@@ -524,8 +531,8 @@ def cells(monkeypatch):
     ones: dict[str, Any] = dict.fromkeys(margins.Margins._fields, np.ones(1))
     left = margins.Margins(**ones)
     monkeypatch.setattr(montecarlo, "run", lambda *_: trials)
-    monkeypatch.setattr(run_margins, "at_ends", lambda _: {"hand_over": (left, 0.9), "hold": (left, 0.9)})
-    monkeypatch.setattr(covariance, "noise", lambda _: covariance.Noise(5e-4, 2.0, 0.1))
+    monkeypatch.setattr(run_margins, "margins_at_ends", lambda _: {"hand_over": (left, 0.9), "hold": (left, 0.9)})
+    monkeypatch.setattr(covariance, "propagate_noise", lambda _: covariance.Noise(5e-4, 2.0, 0.1))
 
 
 @pytest.mark.usefixtures("cells")
@@ -576,7 +583,7 @@ done
 def test_long_run_prints_its_number_of_integration_steps(command, monkeypatch):
     run = ("simulate", "s.toml", "--no-figures", "--force")
     parts = scenario.study(scenario.read("s.toml")).parts
-    steps = timing.steps(parts)
+    steps = timing.count_steps(parts)
     assert steps == parts.clock.ticks(parts.controller.t_f, parts.controller.delta).t.size * parts.substeps
     assert "integration steps" not in command(*run)[1]
     monkeypatch.setattr("tuning.cli.main.LONG", steps - 1)

@@ -40,7 +40,7 @@ def test_all_representations_are_the_same_attitude(sequence):
         q *= np.sign(q[3]) / np.linalg.norm(q)
         if 2.0 * np.arccos(q[3]) > np.deg2rad(170.0):  # near the singularity of the law in Case I
             continue
-        said = convert.lines(q, sequence)
+        said = convert.attitude_lines(q, sequence)
         assert [line.split(" = ")[0] for line in said] == list(ATTITUDE_KEYS)
         for line in said:
             again = pasted(line, sequence or "ZYX")
@@ -98,6 +98,6 @@ def test_invalid_attitudes_are_refused(command, tmp_path, options, said):
 
 
 def test_zero_rotation_is_printed_without_rounding_errors():
-    said = convert.lines(np.array([0.0, 0.0, -1.2246e-16, 1.0]))
+    said = convert.attitude_lines(np.array([0.0, 0.0, -1.2246e-16, 1.0]))
     assert "rotvec_deg = [0, 0, 0]  # 0 degrees" in said
     assert 'euler_deg = [0, 0, 0]  # with sequence = "ZYX"' in said

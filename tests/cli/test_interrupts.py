@@ -75,7 +75,7 @@ def search_of(status, write, report=lambda _: EMPTY, command="tune"):
 def recorded(summary, command="tune"):
     """Return a function that writes a result folder with this summary."""
     made_by = {"command": command, "seed": 0}
-    return lambda making, _: store.record(making, parsing.dump(LOADED), made_by, summary)
+    return lambda making, _: store.write_run_files(making, parsing.dump(LOADED), made_by, summary)
 
 
 @pytest.mark.parametrize(("force", "same"), [(False, "the same command"), (True, "the same command without --force")])

@@ -29,7 +29,7 @@ FLIGHT = ROOT / "scenarios" / "first_flight.toml"
 
 @pytest.mark.parametrize("plant", ["spacecraft", "chain"])
 def test_new_writes_the_default_scenario(plant):
-    written = tomllib.loads(new.text(plant, {}))
+    written = tomllib.loads(new.scenario_text(plant, {}))
     assert parsing.dump(from_tables(written)) == parsing.dump(from_tables({"plant": {"kind": plant}}))
     assert len(written) > 4  # with explicit keys
 
@@ -43,15 +43,15 @@ def test_schema_command_does_not_overwrite_its_file(command, tmp_path):
 
 
 def test_new_does_not_need_docstrings():
-    call = [sys.executable, "-OO", "-c", "from tuning.cli import new; print(new.text('chain', {}), end='')"]
+    call = [sys.executable, "-OO", "-c", "from tuning.cli import new; print(new.scenario_text('chain', {}), end='')"]
     done = subprocess.run(call, capture_output=True, text=True, cwd=ROOT, check=False)
-    assert (tomllib.loads(done.stdout), done.stderr) == (tomllib.loads(new.text("chain", {})), "")
+    assert (tomllib.loads(done.stdout), done.stderr) == (tomllib.loads(new.scenario_text("chain", {})), "")
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "scenarios").glob("*.toml")), ids=lambda path: path.stem)
 def test_new_like_a_scenario_writes_the_same_scenario(path):
     raw = parsing.load(path)
-    written = tomllib.loads(new.text(None, raw))
+    written = tomllib.loads(new.scenario_text(None, raw))
     assert parsing.dump(from_tables(written)) == parsing.dump(from_tables(raw))
     assert all(set(given) <= set(written[table]) for table, given in raw.items())
 
@@ -60,7 +60,7 @@ def test_new_like_a_scenario_writes_the_same_scenario(path):
 def test_commented_keys_of_other_laws_are_their_defaults(name):
     """The commented keys of a law have the same values as a scenario with only its kind and t_f."""
     raw = parsing.load(ROOT / "benchmarks" / "satellites" / f"{name}.toml")
-    others = [values(lines) for lines in kinds(blocks(new.text(None, raw))["controller"])[1:]]
+    others = [values(lines) for lines in kinds(blocks(new.scenario_text(None, raw))["controller"])[1:]]
     others = [other for other in others if other["kind"] != "custom"]
     assert len(others) > 5
     for other in others:
@@ -73,14 +73,14 @@ def test_keys_of_custom_classes_keep_their_order_and_are_quoted():
     custom = {"kind": "custom", "code": "mine.py:Mine", "größe": 3.0, "beta": 1.0, "alpha": 4.0}
     terms = [custom, {"kind": "none"}]
     raw = {"disturbance": {"kind": "sum", "terms": terms}, "dispersion": {"custom": custom}, "reference": custom}
-    written = tomllib.loads(new.text(None, raw))
+    written = tomllib.loads(new.scenario_text(None, raw))
     assert list(written["reference"])[-3:] == ["größe", "beta", "alpha"]
     assert (written["dispersion"]["custom"], written["disturbance"]["terms"]) == (custom, terms)
 
 
 @pytest.mark.parametrize("plant", layouts.TABLES)
 def test_every_key_of_the_plant_is_written_with_its_meaning(plant):
-    text = new.text(plant, {})
+    text = new.scenario_text(plant, {})
     found = blocks(text)
     names = list(layouts.TABLES[plant])
     names.insert(names.index("tune"), "requirements")
@@ -117,17 +117,17 @@ def test_commented_keys_are_valid(plant):
 
 def test_new_refuses_unknown_plants_and_invalid_scenarios():
     with pytest.raises(UsageError, match=f"--plant is boat, but must be {PLANTS}"):
-        new.text("boat", {})
+        new.scenario_text("boat", {})
     with pytest.raises(UsageError, match="--plant is chain, but the scenario of --like has"):
-        new.text("chain", parsing.load(FLIGHT))
+        new.scenario_text("chain", parsing.load(FLIGHT))
     with pytest.raises(ScenarioError, match=r"controller\.eta is 1"):
-        new.text(None, {"controller": {"eta": 1.0}})
+        new.scenario_text(None, {"controller": {"eta": 1.0}})
 
 
 def test_new_command_does_not_overwrite_files(command, tmp_path):
     assert command("new") == (0, "scenario in scenario.toml\n", "")
     written = (tmp_path / "scenario.toml").read_text()
-    assert written == new.text(None, {})
+    assert written == new.scenario_text(None, {})
     code, _, error = command("new")
     assert (code, error) == (
         2,
@@ -135,7 +135,7 @@ def test_new_command_does_not_overwrite_files(command, tmp_path):
         "over it\n",
     )
     assert command("new", "--like", FLIGHT, "--force", "--quiet") == (0, "", "")
-    assert (tmp_path / "scenario.toml").read_text() == new.text(None, parsing.load(FLIGHT)) != written
+    assert (tmp_path / "scenario.toml").read_text() == new.scenario_text(None, parsing.load(FLIGHT)) != written
 
 
 def test_file_name_is_escaped_if_the_output_encoding_lacks_its_letters(command, tmp_path, monkeypatch):
@@ -168,7 +168,7 @@ def test_new_command_refuses_invalid_options_and_writes_nothing(command, tmp_pat
 def test_commented_keys_have_their_default_values(tmp_path):
     """The gain of a finite-time observer is 20 times a bound, and positive if the bound is zero."""
     for bound, gain in ((0.0, 0.02), (2e-3, 0.04)):
-        lines = blocks(new.text(None, {"controller": {"disturbance_rate_bound": bound}}))["observer"]
+        lines = blocks(new.scenario_text(None, {"controller": {"disturbance_rate_bound": bound}}))["observer"]
         (shown,) = (values(group)["gain"] for group in kinds(lines) if values(group)["kind"] == "finite_time")
         assert shown == pytest.approx([gain] * 3)
         given = {"controller": {"disturbance_rate_bound": bound}, "observer": {"kind": "finite_time"}}

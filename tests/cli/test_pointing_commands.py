@@ -42,7 +42,7 @@ def one_by_one():
 
     def one(parts, dispersion, seed, trial):
         at = np.uint32(seed), np.uint32(trial)
-        run = rollout.simulate_parts(drawn(parts, dispersion, *at), *at, record=True, software=rollout.OURS)
+        run = rollout.simulate_parts(drawn(parts, dispersion, *at), *at, record=True, software=rollout.PYTHON_SOFTWARE)
         simulated = values(parts, dispersion, *at)
         return jax.tree.map(np.asarray, (run.metrics, run.status, run.bad_time, simulated, {}, run.samples))
 
@@ -98,11 +98,11 @@ def test_pointing_requirements_have_verdicts_budget_and_table(simulated, tmp_pat
         assert "from 0.5 s after t_f to t_end, with 95 % confidence; boresight 1, 0, 0" in place
         assert "an angle is - without 1109 runs that all reach their end (852 for 90 % confidence)" in place
         assert "ape_boresight at most 2062.65 arcsec in 50 % of the time of all runs" in place
-    table = pointing_report.compliance(summaries.read(summaries.Campaign, found))
+    table = pointing_report.compliance_table(summaries.read(summaries.Campaign, found))
     assert table is not None
     assert [row[:7] for row in table.rows] == [
         ("RPE", "half-cone", "1.15 deg", "90 %", "ensemble", "90 %",
-         formats.angle(ensemble["margin"] * 0.02)),
+         formats.format_angle(ensemble["margin"] * 0.02)),
         ("APE", "half-cone", "2063 arcsec", "50 %", "mixed", "90 %", f"{percent(mixed['shown'])} % of the time"),
         ("AKE", "x", "20.6 arcsec", "99.73 %", "temporal", "not required",
          f"{percent(temporal['shown'])} % of the time"),
@@ -135,17 +135,17 @@ def test_pointing_budget_is_an_order_statistic(monkeypatch, simulated):
     from tuning.studies import campaign_summary
 
     rows, found = simulated[2:]
-    monkeypatch.setattr(campaign_summary, "SHOWN", 0.9)
+    monkeypatch.setattr(campaign_summary, "BUDGET_FRACTION", 0.9)
     from pathlib import Path
 
     from tuning.studies import campaign_folder
 
-    again = campaign_summary.summarise(campaign_folder.opened(Path(FOLDER)))["pointing"]["budget"]
+    again = campaign_summary.summarise(campaign_folder.open_folder(Path(FOLDER)))["pointing"]["budget"]
     ordered = np.sort(rows["mpe_y"].to_numpy())
     least = next(k for k in range(1, 151) if statistics.fraction_bound(k, 150, 0.95) >= 0.9)
     assert again["mpe"]["y"] == ordered[least - 1]
     read = summaries.read(summaries.Campaign, {**found, "pointing": {**found["pointing"], "budget": again}})
-    assert formats.angle(again["mpe"]["y"]) in str(pointing_report.budget(read))
+    assert formats.format_angle(again["mpe"]["y"]) in str(pointing_report.budget_table(read))
 
 
 def test_single_run_has_the_pointing_indices(command, simulated, tmp_path):

@@ -87,9 +87,9 @@ def test_linearised_loop_includes_the_filter():
     found, tones = [], (0.3, 2.0, 6.0, 15.0)
     for hardware in ({}, {"hardware": {"command_filter": {"kind": "second_order", "corner": 6.0, "damping": 0.7}}}):
         parts = scenario.study(scenario.from_tables({**ALONE, **hardware})).parts
-        run = linear.nominal_jit(parts)
-        loops = linear.loops_in(parts, run, linear.full_periods(parts, run, hold=True)[-1:])
-        opening = linear.at_input(jax.tree.map(lambda v: v[0], loops))
+        run = linear.simulate_nominal_jit(parts)
+        loops = linear.open_loops(parts, run, linear.full_periods(parts, run, hold=True)[-1:])
+        opening = linear.open_at_input(jax.tree.map(lambda v: v[0], loops))
         found.append(jax.jit(crossings.in_schur_coordinates(opening).response)(np.exp(1j * H * np.array(tones)))[0])
     b, a = signal.bilinear([36.0], [1.0, 2 * 0.7 * 6.0, 36.0], fs=6.0 / (2 * np.tan(6.0 * H / 2)))
     for w, without, behind in zip(tones, *found, strict=True):

@@ -28,7 +28,9 @@ def drive_of(device, v, c):
 
 
 # the first channel's torque, its integral and its double integral at times (time,)
-channels = jax.jit(jax.vmap(lambda device, drive, s: jnp.stack(device.channels(drive, s))[:, 0], (None, None, 0)))
+channels = jax.jit(
+    jax.vmap(lambda device, drive, s: jnp.stack(device.channel_torques(drive, s))[:, 0], (None, None, 0))
+)
 
 
 @pytest.mark.parametrize("lag", [None, 0.03, 0.5])
@@ -295,7 +297,7 @@ def test_wheel_and_allocation_change_at_the_same_sample_on_failure(early):
     drive, _ = failing.command(failing.begin(3), u, vector(np.zeros(3)), at, one, one)
     assert drive.works is not None
     assert drive.works.tolist() == [early, True, True, True]
-    np.testing.assert_allclose(failing.on_body(failing.at(drive, vector(0.5))[0]), u, atol=1e-15)
+    np.testing.assert_allclose(failing.on_body(failing.torque_and_momentum(drive, vector(0.5))[0]), u, atol=1e-15)
     assert (abs(float(drive.c[0])) > 1e-3) is early
 
 
@@ -409,7 +411,12 @@ def test_gradients_are_finite_where_functions_are_not_differentiable():
         state = actuators.ActuatorState(u[None], v, h)
         drive, queue = device.command(state, u, vector([0.0] * 3), vector(0.0), dt, vector(1.0))
         end = device.end(state, drive, queue, dt)
-        return device.on_body(device.at(drive, dt)[0]), device.over(drive, 0.0 * dt, dt), end.v, end.h
+        return (
+            device.on_body(device.torque_and_momentum(drive, dt)[0]),
+            device.torque_over(drive, 0.0 * dt, dt),
+            end.v,
+            end.h,
+        )
 
     slopes_of = jax.jit(jax.jacfwd(outcome, (0, 1, 2, 3)))
     zero, full = vector([0.0] * 4), vector([0.5] * 4)

@@ -38,7 +38,7 @@ def filtered(suite, trial, count):
 
     def step(memory, k):
         dt = jnp.where(k > 0, H, 0.0)
-        ages = suite.taken_ago(k, dt)
+        ages = suite.newest_reading_age(k, dt)
         star_x = jax.tree.map(lambda age: state(k * H - age), ages)
         x = state(k * H)
         _, memory = suite.measure(memory, x, tick(k), dt, star_x)
@@ -155,23 +155,25 @@ def test_filter_equals_batch_conditioning_on_all_readings():
 def test_each_reading_is_used_once_at_the_first_sample_after_its_latency(interval, latency):
     times = attitude_sensors.sample_times(interval * H, latency * H, H)
     samples = jnp.arange(-40, 60)
-    due, age = (np.broadcast_to(v, samples.shape) for v in (times.due(samples), times.age(samples)))
+    due, age = (
+        np.broadcast_to(v, samples.shape) for v in (times.is_reading_due(samples), times.delivered_age(samples))
+    )
     taken = (np.asarray(samples) - age / H)[due]
     np.testing.assert_allclose(np.diff(taken), interval, rtol=0, atol=1e-9)
     numbers = taken / interval
     np.testing.assert_allclose(numbers, np.round(numbers), rtol=0, atol=1e-9)
     used = np.asarray(samples)[due]
     np.testing.assert_array_equal(used, np.ceil(taken + latency - 1e-9))
-    assert np.all(used - taken < times.past + 1e-9)
+    assert np.all(used - taken < times.past_samples + 1e-9)
 
 
 def test_a_delayed_reading_is_the_attitude_at_its_own_time():
     """Without noise the reading is the attitude when it was taken, and the estimate stays exact."""
-    suite = suites.two_star_trackers(H, (2.5, 3.0), (1.2, 2.0)).quiet()
+    suite = suites.two_star_trackers(H, (2.5, 3.0), (1.2, 2.0)).without_noise()
     memory, seen = suite.begin(0, 0, state(0.0), tick(0)), None
     for k in range(12):
         dt = vector(H if k else 0.0)
-        star_x = jax.tree.map(lambda age, k=k: state(k * H - age), suite.taken_ago(jnp.asarray(k), dt))
+        star_x = jax.tree.map(lambda age, k=k: state(k * H - age), suite.newest_reading_age(jnp.asarray(k), dt))
         found, _ = suite.inputs(memory, state(vector(k * H)), tick(k), dt, star_x)
         seen, memory = suite.measure(memory, state(vector(k * H)), tick(k), dt, star_x)
         for sensor in suite.sensors:
@@ -184,13 +186,13 @@ def test_a_delayed_reading_is_the_attitude_at_its_own_time():
 
 @pytest.mark.parametrize("case", ["latency", "own clocks", "outage"])
 def test_available_and_lag_equal_the_simulated_readings(case):
-    suite, count = CASES[case]().quiet(), 40
+    suite, count = CASES[case]().without_noise(), 40
     ticks = jax.vmap(tick)(jnp.arange(count))
-    available, lag = suite.available(ticks), suite.lag(ticks)
+    available, lag = suite.available(ticks), suite.sample_delays(ticks)
     memory = suite.begin(0, 0, state(0.0), tick(0))
     for k in range(count):
         dt = vector(H if k else 0.0)
-        star_x = jax.tree.map(lambda age, k=k: state(k * H - age), suite.taken_ago(jnp.asarray(k), dt))
+        star_x = jax.tree.map(lambda age, k=k: state(k * H - age), suite.newest_reading_age(jnp.asarray(k), dt))
         found, memory = suite.inputs(memory, state(vector(k * H)), tick(k), dt, star_x)
         for j, sensor in enumerate(suite.sensors):
             valid = bool(found[f"{sensor.name}_valid"] > 0.0)
@@ -205,7 +207,7 @@ def test_available_and_lag_equal_the_simulated_readings(case):
 
 
 def test_no_random_numbers_are_generated_without_noise():
-    quiet = suites.two_star_trackers(H).quiet()
+    quiet = suites.two_star_trackers(H).without_noise()
     trace = jax.make_jaxpr(lambda seed: quiet.begin(seed, 0, state(0.0), tick(0)))(jnp.uint32(3))
     assert not any(one.primitive.name == "shift_left" for one in equations(trace))  # every random number needs it
 

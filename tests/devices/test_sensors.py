@@ -59,7 +59,7 @@ def test_noise_has_the_stated_size_about_every_body_axis(errors):
 @pytest.mark.parametrize("filtered", [False, True])
 def test_sensors_without_noise_measure_the_true_state_without_random_numbers(filtered):
     noisy = sensors.Sensors(vector(SIZES[0]), vector(SIZES[1]), rate_bias=vector(1e-6), bias_rate=vector(1e-8))
-    quiet = (noisy.with_bandwidth(vector(0.2), vector(0.05)) if filtered else noisy).quiet()
+    quiet = (noisy.with_bandwidth(vector(0.2), vector(0.05)) if filtered else noisy).without_noise()
     x = STATE._replace(w=0.0 * STATE.w) if filtered else STATE  # a filter propagates from the sample before
     measured = seen_by(quiet, x, 3, 4, 5)
     np.testing.assert_allclose(measured.q, x.q, rtol=8 * EPS)
@@ -243,7 +243,7 @@ def test_bias_of_the_gyro_is_constant_and_has_its_size():
 def test_noise_density_gives_the_deviation_of_a_sample():
     """The integral of white noise of density N over a time t has the variance N^2 t for every sample period."""
     for period in (0.01, 0.2):
-        sigma = formulas.per_sample(1e-5, period)
+        sigma = formulas.noise_per_sample(1e-5, period)
         np.testing.assert_allclose(sigma * period * np.sqrt(100.0 / period), 1e-5 * np.sqrt(100.0), rtol=1e-12)
 
 

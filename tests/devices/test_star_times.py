@@ -32,10 +32,10 @@ def of(**hardware):
 def test_samples_are_used_at_the_same_times_in_32_bits(interval):
     times, count = attitude_sensors.sample_times(interval, 0.0, 0.1), 18_000
     for first in (0, -count):  # half an hour, after which the resolution of 32 bits is a thousandth of a period
-        due = times.due(jnp.arange(first, first + count))
+        due = times.is_reading_due(jnp.arange(first, first + count))
         with jax.enable_x64(False):
             short = jax.tree.map(lambda v: v.astype(jnp.float32), times)
-            off = np.cumsum(short.due(jnp.arange(first, first + count))) - np.cumsum(due)
+            off = np.cumsum(short.is_reading_due(jnp.arange(first, first + count))) - np.cumsum(due)
         # rounding may shift a sample by one if times nearly coincide
         assert np.abs(off).max() <= (times.pattern[0] > 10)
 
@@ -73,7 +73,7 @@ def run():
     ready = of(star_tracker_period=0.25, rate_bias=1e-4)
     parts = dataclasses.replace(ready.parts, walk_rate=None)
     simulated = vectors.simulate_many(parts, ready.dispersion, jnp.uint32(3), jnp.arange(1, dtype=jnp.uint32))
-    return parts, vectors.one(simulated, 0)
+    return parts, vectors.single_trial(simulated, 0)
 
 
 def test_filter_equals_the_independent_computation(run):
@@ -136,7 +136,7 @@ NOISES = {"bandwidth": 0.15, "attitude_noise": 2e-5, "rate_noise": 2e-6, "bias_w
 
 @pytest.mark.parametrize("every", [1, 4])
 def test_filter_between_equals_attitude_filter_for_an_integer_ratio(every):
-    found = star_times.filter_between(*NOISES.values(), interval=0.25 * every, repeating=(every, 1))
+    found = star_times.filter_between_samples(*NOISES.values(), interval=0.25 * every, repeating=(every, 1))
     known = attitude_filter.attitude_filter(*NOISES.values(), every)
     for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(known), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-20)
@@ -145,7 +145,7 @@ def test_filter_between_equals_attitude_filter_for_an_integer_ratio(every):
 def test_filter_errors_have_the_steady_state_covariance_from_the_first_sample():
     """4 000 trials of a body at rest. The sample times repeat after five periods with two star tracker samples."""
     times = attitude_sensors.sample_times(0.625, 0.0, 0.25)
-    found = star_times.filter_between(*NOISES.values(), times.interval, times.pattern)
+    found = star_times.filter_between_samples(*NOISES.values(), times.interval, times.pattern)
     walk = NOISES["bias_walk"] / np.sqrt(NOISES["period"])
     sensor = sensors.Sensors(vector(NOISES["attitude_noise"]), vector(NOISES["rate_noise"]), vector(1e-4),
                              vector(walk), found, own_times=times)  # fmt: skip
@@ -184,7 +184,7 @@ def test_in_an_outage_the_filter_propagates_the_whole_period_at_once(run):
     x = rigid_body.AttitudeState(vector([0.0, 0.0, 0.0, 1.0]), vector([0.3, -0.2, 0.1]))
     now = Ticks(vector(0.8), vector(0.9), jnp.asarray(True), jnp.int32(8), vector(1.0), jnp.asarray(False))
     memory = seen.begin(7, 0, x, now)._replace(rate=vector([-0.2, 0.3, 0.25]))
-    assert seen.own_times.due(8)  # at 0.75 s
+    assert seen.own_times.is_reading_due(8)  # at 0.75 s
     found, after = seen.measure(memory, x, now, vector(0.1), x)
     alone = seen.filter.propagate(memory.estimate, memory.rate, after.rate, vector(0.1))
     np.testing.assert_allclose(found.q, alone.q, rtol=0, atol=1e-15)
@@ -219,7 +219,7 @@ def test_metrics_are_continuous_when_the_partial_first_period_vanishes(anchored)
 def test_in_step_gives_the_same_correction_and_noise_per_interval():
     """The sum of the corrections in an interval is the same, and so is the sum of their noise variances."""
     own = of(star_tracker_period=0.25).parts.sensors
-    often, share = own.in_step(), 0.1 / 0.25
+    often, share = own.at_control_samples(), 0.1 / 0.25
     assert often.own_times is None
     for name in ("attitude_gain", "bias_gain"):
         gain, each = (float(getattr(one.filter, name)) for one in (own, often))
@@ -227,7 +227,7 @@ def test_in_step_gives_the_same_correction_and_noise_per_interval():
         noise, noises = float(gain * own.attitude_noise) ** 2, float(each * often.attitude_noise) ** 2
         np.testing.assert_allclose(noises / share, noise, rtol=1e-12)
     whole = of(star_tracker_every=2).parts.sensors
-    assert whole.in_step() is whole
+    assert whole.at_control_samples() is whole
 
 
 def test_a_constant_gyro_bias_has_no_effect_with_the_filter():

@@ -134,15 +134,15 @@ def test_wheels_with_scale_and_misalignment_deliver_and_store_momentum_along_the
     torque = scale * (np.linalg.pinv(np.array(wheels.axes)) @ np.array(command))
     assert np.abs(torque).min() > 1e-2
     stored = np.array([0.5, -0.2, 0.1, 0.3])
-    applied = device.over(drive, vector(0.2), vector(0.1))
+    applied = device.torque_over(drive, vector(0.2), vector(0.1))
     np.testing.assert_allclose(applied.mean, turned @ torque, rtol=1e-13)
     np.testing.assert_allclose(np.asarray(applied.stored), turned @ (stored - 0.2 * torque), rtol=1e-13)
-    np.testing.assert_allclose(device.on_body(device.at(drive, dt)[0]), turned @ torque, rtol=1e-13)
+    np.testing.assert_allclose(device.on_body(device.torque_and_momentum(drive, dt)[0]), turned @ torque, rtol=1e-13)
     np.testing.assert_allclose(np.asarray(device.end(start, drive, queue, dt).h), stored - 0.5 * torque, rtol=1e-13)
     failing = replace(device, failure_times=vector([np.inf, 0.0, np.inf, np.inf]))  # unknown to the flight software
     drive, queue = failing.command(start, command, vector(np.zeros(3)), vector(0.0), dt, vector(1.0))
     torque[1] = 0.0
-    np.testing.assert_allclose(failing.on_body(failing.at(drive, dt)[0]), turned @ torque, rtol=1e-13)
+    np.testing.assert_allclose(failing.on_body(failing.torque_and_momentum(drive, dt)[0]), turned @ torque, rtol=1e-13)
     np.testing.assert_allclose(np.asarray(failing.end(start, drive, queue, dt).h), stored - 0.5 * torque, rtol=1e-13)
 
 

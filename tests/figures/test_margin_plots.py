@@ -17,7 +17,7 @@ def margins(times):
 
 def test_the_axis_of_the_time_to_go_has_plain_numbers():
     """The numbers have no powers of ten such as 3 x 10^1."""
-    figure = margin_plots.over_time(np.array([34.0, 25.0, 10.0, 5.0, 3.0]), margins(5), margins(1))
+    figure = margin_plots.margins_over_time(np.array([34.0, 25.0, 10.0, 5.0, 3.0]), margins(5), margins(1))
     figure.draw_without_rendering()
     labels = [label.get_text() for label in figure.axes[-1].get_xticklabels(which="both") if label.get_text()]
     assert {"5", "10", "20"} <= set(labels)
@@ -27,10 +27,10 @@ def test_the_axis_of_the_time_to_go_has_plain_numbers():
 def test_a_panel_states_that_there_is_no_limit():
     """A saturated loop tolerates any gain and delay. An earlier version left the panel empty."""
     few, free = np.array([10.0, 5.0]), {name: np.full((2, 3), np.inf) for name in ("gain_up", "gain_down")}
-    figure = margin_plots.over_time(few, margins(2)._replace(**free), margins(1)._replace(**free))
+    figure = margin_plots.margins_over_time(few, margins(2)._replace(**free), margins(1)._replace(**free))
     assert [[text.get_text() for text in axes.texts] for axes in figure.axes] == [["without a limit"], [], []]
     one = margins(1)._replace(gain_up=np.array([[np.inf, 6.0, np.inf]]))
-    assert not margin_plots.over_time(few, margins(2)._replace(**free), one).axes[0].texts
+    assert not margin_plots.margins_over_time(few, margins(2)._replace(**free), one).axes[0].texts
 
 
 def test_a_loop_gain_of_zero_is_drawn_without_a_warning():

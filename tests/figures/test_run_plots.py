@@ -32,7 +32,7 @@ def test_a_peak_of_the_command_is_labelled_as_commanded(text, delay, unit, said)
 def test_no_two_of_twenty_states_look_alike():
     """An earlier version drew x6, x11 and x16 with the same colour, style and width."""
     axes = Figure().subplots()
-    run_plots._components(axes, np.arange(3.0), np.zeros((3, 20)), "x")
+    run_plots._plot_components(axes, np.arange(3.0), np.zeros((3, 20)), "x")
     looks = {(one.get_color(), one.get_linestyle(), one.get_linewidth(), one.get_alpha()) for one in axes.lines}
     assert len(looks) == 20
 

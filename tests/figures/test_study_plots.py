@@ -8,7 +8,7 @@ import pytest
 from matplotlib.legend import Legend
 
 from ptsmc_jax.figures import run_plots, study_plots
-from ptsmc_jax.figures.style import figure_of
+from ptsmc_jax.figures.style import new_figure
 
 GRID = np.array([[1e-5, 2e-5], [3e-5, 4e-5]])
 NAMES = ("window_error", "linear_window_error", "peak_torque", "largest_peak_torque")
@@ -112,9 +112,9 @@ def test_a_profile_with_few_values_shows_the_whole_interval_of_its_gain(known):
 
 @pytest.mark.parametrize(("limit", "drawn"), [(2.9, True), (3.1, False)])
 def test_a_limit_far_above_the_curves_is_labelled_and_does_not_flatten_them(limit, drawn):
-    _, axes = figure_of("torque", "u")
+    _, axes = new_figure("torque", "u")
     axes.plot([0.0, 1.0], [-1.0, 0.5])
-    run_plots._limit(axes, limit, " N m")
+    run_plots._draw_limit(axes, limit, " N m")
     assert (max(axes.get_ylim()) > 2.0) == drawn
     (said,) = [line.get_label() for line in axes.lines if str(line.get_label()).startswith("limit")]
     assert said == f"limit {limit:g} N m" + ("" if drawn else ", beyond this axis")

@@ -72,7 +72,7 @@ def test_the_identified_scenario_has_the_estimate_and_its_covariance(identified)
     np.testing.assert_allclose(np.asarray(ready.parts.plant.inertia)[np.triu_indices(3)], found.estimate, rtol=1e-12)
     draw = jax.jit(jax.vmap(lambda trial: ready.dispersion.apply(ready.parts, 0, trial).plant.inertia))
     bodies = np.asarray(draw(jnp.arange(4000)))
-    assert formulas.bodies(bodies).all()
+    assert formulas.is_rigid_body(bodies).all()
     # the covariance of 4000 random samples differs by a few per cent; the density is normal in other coordinates
     std = np.std(bodies, axis=0)[np.triu_indices(3)]
     np.testing.assert_allclose(std, found.std, rtol=0.1)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import strategies as st
 
 from ptsmc_jax import formulas
-from ptsmc_jax.laws.prescribed_time import expansion
+from ptsmc_jax.laws.prescribed_time import surface_coefficients
 from ptsmc_jax.plants import integrator_chain
 from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation import rollout
@@ -66,8 +66,8 @@ def test_surface_37_equals_its_definition_36(n):
     at = jnp.stack([state(t) for state in states])
     _, s = torque(law, vector(t), BEFORE, at, None, jnp.zeros(1), vector(0.0))
     np.testing.assert_allclose(s[0], derivative(t) * (t_f - t) ** (eta + n - 1), rtol=1e-11)
-    assert [float(c) for c in expansion(vector(3.0), 2)] == [3.0, 1.0]  # (7)
-    assert [float(c) for c in expansion(vector(4.0), 3)] == [20.0, 8.0, 1.0]
+    assert [float(c) for c in surface_coefficients(vector(3.0), 2)] == [3.0, 1.0]  # (7)
+    assert [float(c) for c in surface_coefficients(vector(4.0), 3)] == [20.0, 8.0, 1.0]
 
 
 @pytest.mark.parametrize("n", [2, 3, 4, 5])
@@ -102,9 +102,9 @@ def test_hurwitz_check_agrees_with_eigenvalues(n):
         a = rng.normal(size=n - 1) + 1.0
         matrix = np.diag(np.ones(n - 2), 1)
         matrix[-1] = -a
-        assert formulas.hurwitz(a) == bool(np.all(np.linalg.eigvals(matrix).real < 0.0))
-    assert not formulas.hurwitz([0.0] * (n - 1))
-    assert formulas.hurwitz([math.comb(n - 1, i) for i in range(n - 1)])  # the default
+        assert formulas.is_hurwitz(a) == bool(np.all(np.linalg.eigvals(matrix).real < 0.0))
+    assert not formulas.is_hurwitz([0.0] * (n - 1))
+    assert formulas.is_hurwitz([math.comb(n - 1, i) for i in range(n - 1)])  # the default
 
 
 EXACT = [(2, 5.0), (3, 30.0), (5, 0.7), (3, 5.0), (4, 5.0), (5, 5.0)]

@@ -195,7 +195,7 @@ def test_input_produces_the_acceleration_of_the_error_that_the_paper_of_the_law_
     e, w, bound = independent_error(plant, x, d)
     memory, numpy_memory, profile = law.begin(), None, None
     if name.startswith("time_base"):
-        memory, numpy_memory = time_base.Start(jnp.ones(()), vector(start), vector(rate)), (start, rate)
+        memory, numpy_memory = time_base.ProfileStart(jnp.ones(()), vector(start), vector(rate)), (start, rate)
         profile = attitude_profile(start, rate, T) if plant == "attitude" else None
     elif name == "super_twisting":
         memory = numpy_memory = vector(start)
@@ -340,7 +340,7 @@ def test_derivatives_of_a_run_include_the_memory_of_the_law(name):
 
 
 def test_profile_is_the_quintic_from_the_measured_error_to_rest():
-    law, start = build_law("time_base_pd"), time_base.Start(jnp.ones(()), vector([1.4]), vector([-0.3]))
+    law, start = build_law("time_base_pd"), time_base.ProfileStart(jnp.ones(()), vector([1.4]), vector([-0.3]))
     profile = jax.jit(law.profile)
     for t in (0.0, 0.4, 2.5, 4.9, T_F, T_F + 1.0):
         for found, exact in zip(
@@ -362,7 +362,7 @@ def test_attitude_profile_rotates_about_the_eigenaxis():
     axis = np.array([0.6, 0.0, -0.8])
     profile = jax.jit(build_law("time_base_pd", MultiplicativeKinematics, BODY).profile)
     for turn, rate in ((2.4, 0.0), (1.0, 0.3), (0.0, 0.0)):
-        start = time_base.Start(jnp.ones(()), vector(turn * axis), vector(rate * axis))
+        start = time_base.ProfileStart(jnp.ones(()), vector(turn * axis), vector(rate * axis))
         for t in (0.0, 1.7, 4.6, T_F, 5.5):
             angle, speed, change = quintic(np.array(turn), np.array(rate), t)
             v, v_dot, v_ddot = profile(start, vector(t))

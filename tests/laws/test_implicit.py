@@ -10,7 +10,7 @@ import pytest
 from ptsmc_jax import scenario
 from ptsmc_jax.laws.base import Sample
 from ptsmc_jax.laws.kinematics import ChainKinematics, MultiplicativeKinematics, SecondOrderKinematics
-from ptsmc_jax.laws.prescribed_time import PrescribedTime, PrescribedTimeChain, expansion
+from ptsmc_jax.laws.prescribed_time import PrescribedTime, PrescribedTimeChain, surface_coefficients
 from ptsmc_jax.numerics import integrators
 from ptsmc_jax.plants import integrator_chain, rigid_body, system
 from ptsmc_jax.scenario.errors import ScenarioError
@@ -65,7 +65,7 @@ def test_s_at_the_samples_equals_the_continuous_law(order):
     fraction = (0.4 / left[last]) ** (order + 0.7 - np.arange(order))
     weights = {2: [1.0, 1.0], 3: [1.0, 2.0, 1.0]}[order]
     np.testing.assert_allclose(s[last + 1], weights @ (fraction * x[last]), rtol=1e-10)
-    c = np.array([float(v) for v in expansion(vector(order + 0.7), order)])
+    c = np.array([float(v) for v in surface_coefficients(vector(order + 0.7), order)])
     np.testing.assert_allclose(s[0], c @ (T_F ** np.arange(order) * x[0]), rtol=1e-14)
 
 
@@ -143,7 +143,7 @@ def test_implicit_gains_equal_the_law_and_are_stable_for_any_delta(eta):
         jacobian = jax.jit(jax.jacfwd(lambda x, now=now: law(now, x, None, jnp.zeros(1), vector(0.0))[0]))(jnp.zeros(2))
         kp, kd = stability_limits.implicit_gains(eta, tau)
         np.testing.assert_allclose(jacobian, [[-kp / H**2, -kd / H]], rtol=1e-12)
-        assert stability_limits.radius(kp, kd, 1.0) < 1.0
+        assert stability_limits.spectral_radius(kp, kd, 1.0) < 1.0
     assert stability_limits.smallest_delta(eta, H, implicit=True) == 0.0
     delayed = [stability_limits.smallest_delta(eta, H, 1.0, implicit=implicit) for implicit in (True, False)]
     assert 0.0 < delayed[0] < delayed[1]
@@ -199,15 +199,15 @@ def test_simulated_loop_is_stable_beyond_the_stability_limit_of_explicit_samplin
     radius = {}
     for sampling in ("explicit", "implicit"):
         parts = chain_parts(eta=4.0, delta=H, sampling=sampling, clock=clock)
-        law, run = parts.controller, linear.nominal_jit(parts)
+        law, run = parts.controller, linear.simulate_nominal_jit(parts)
         last = linear.full_periods(parts, run, hold=False)[-1:]
-        loop = jax.tree.map(lambda v: np.asarray(v)[0], linear.loops_in(parts, run, last))
-        radius[sampling] = linear.radius(loop)
+        loop = jax.tree.map(lambda v: np.asarray(v)[0], linear.open_loops(parts, run, last))
+        radius[sampling] = linear.spectral_radius(loop)
         tau = float(law.t_f - run.period.now.t[last[0]]) / H
         kp, kd = stability_limits.implicit_gains(4.0, tau) if law.implicit else (16.0 / tau**2, 7.0 / tau)
         # without an observer its memory is constant, which is a pole at 1
-        np.testing.assert_allclose(radius[sampling], max(1.0, stability_limits.radius(kp, kd, 1.0)), rtol=1e-6)
-    assert radius["implicit"] < 1.0 + margins.NEUTRAL < 1.1 < radius["explicit"]
+        np.testing.assert_allclose(radius[sampling], max(1.0, stability_limits.spectral_radius(kp, kd, 1.0)), rtol=1e-6)
+    assert radius["implicit"] < 1.0 + margins.CIRCLE_TOLERANCE < 1.1 < radius["explicit"]
 
 
 @pytest.mark.parametrize("hold", [False, True])

@@ -83,7 +83,7 @@ def output_dtypes(trace):
 
 SAMPLED = parts(t_f=2.0, t_end=2.5, period=0.1)
 RUNS = {
-    "nominal run": lambda: jax.make_jaxpr(linear.nominal)(SAMPLED),
+    "nominal run": lambda: jax.make_jaxpr(linear.simulate_nominal)(SAMPLED),
     "sampled": lambda: jax.make_jaxpr(lambda run: rollout.simulate(run, record=True))(SAMPLED),
     "continuous": lambda: jax.make_jaxpr(lambda run: rollout.simulate(run, record=True))(parts()),
     "batch": lambda: jax.make_jaxpr(

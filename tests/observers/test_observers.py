@@ -53,7 +53,9 @@ def test_digital_estimate_of_a_constant_disturbance_is_unbiased(gain):
     d, u, h = np.array([0.02, -0.03, 0.01]), np.array([0.1, 0.3, -0.2]), 0.05
     w, w_next = held_motion(np.asarray(FULL_INERTIA), u + d, h)
     matrix = found.update_matrix(vector(h))
-    impulse = found.model.unexplained_impulse(vector(h), body_state(w), body_state(w_next), vector(u), vector(h))
+    impulse = found.model.implied_disturbance_impulse(
+        vector(h), body_state(w), body_state(w_next), vector(u), vector(h)
+    )
     d_hat = found.update(matrix, vector(d), impulse, vector(h), vector(h))
     # the correct estimate does not change; the trapezoidal rule for the gyroscopic torque has an error of order h^2/12
     np.testing.assert_allclose(d_hat, d, atol=1e-6)
@@ -77,7 +79,7 @@ def test_continuous_estimation_error_obeys_54():
     a = np.diag([10.0, 4.0, 25.0]) @ np.linalg.inv(FULL_INERTIA)
     np.testing.assert_allclose(found.decay_matrix(NOW, NOW), a, rtol=1e-12)
     found_rate = (
-        found.forcing(NOW, (NOW, NOW), d_hat, found.model.unexplained(NOW, body_state(w), x_dot, u))
+        found.forcing(NOW, (NOW, NOW), d_hat, found.model.implied_disturbance(NOW, body_state(w), x_dot, u))
         - found.decay_matrix(NOW, NOW) @ d_hat
     )
     np.testing.assert_allclose(found_rate, -a @ np.asarray(d_hat - d), atol=1e-12)

@@ -81,7 +81,7 @@ def both(folder, function, *args):
 def program(tables, place):
     """Write the controller of a scenario, without test vectors."""
     made = folder.Controller(scenario.reading.complete(scenario.from_tables(tables)), "flight", "a scenario")
-    store.write(place, lambda making: folder.write_program(making, made))
+    store.write_folder(place, lambda making: folder.write_program(making, made))
     return made
 
 
@@ -89,7 +89,7 @@ def replayed(library, samples, state):
     """Statuses, outputs and states of a compiled controller for a sequence of samples."""
     statuses, outputs, states = [], [], []
     for row in samples:
-        state, out, status = library.many(state, row)
+        state, out, status = library.step_many(state, row)
         statuses.append(int(status))
         outputs.append(out)
         states.append(state)

@@ -11,7 +11,7 @@ import pytest
 from ptsmc_jax import scenario
 from ptsmc_jax.observers.base import ErrorBound
 from ptsmc_jax.onboard import folder, vectors
-from ptsmc_jax.onboard.board import board
+from ptsmc_jax.onboard.board import build_board
 from ptsmc_jax.onboard.library import Library, compiler
 from ptsmc_jax.onboard.readme import readme
 from scenarios.own_parts import LowPass
@@ -73,19 +73,19 @@ FLOWN = {
 def off(known, library):
     """Largest difference of the commands of C and of the library, relative to the largest command, in two trials."""
     ready = scenario.study(folder.on_flight_clock(known))
-    computer, trials = board(ready.parts), jnp.arange(2, dtype=jnp.uint32)
+    computer, trials = build_board(ready.parts), jnp.arange(2, dtype=jnp.uint32)
     parts = replace(ready.parts, substeps=10)  # equal for all gains, to share one compiled program
     simulated = vectors.simulate_many(parts, vectors.with_nominal_reference(ready.dispersion), jnp.uint32(0), trials)
     simulated = jax.tree.map(np.asarray, simulated)
     at, worst = library.columns["out"].index("command[0]"), 0.0
     for k in range(len(trials)):
-        samples = vectors.one(simulated, k)
-        assert vectors.usable(samples)
+        samples = vectors.single_trial(simulated, k)
+        assert vectors.is_usable(samples)
         given, out, _ = vectors.rows(computer, samples)
         state, commands = vectors.first_state(computer, samples), slice(at, at + samples.command.shape[1])
         found = np.empty_like(out)
         for n, row in enumerate(given):
-            state, found[n], _ = library.many(state, row)
+            state, found[n], _ = library.step_many(state, row)
         apart = np.abs(found[:, commands] - out[:, commands])
         worst = max(worst, float(np.max(apart) / np.max(np.abs(out[:, commands]))))
     return worst
@@ -101,7 +101,7 @@ def put(library, name, value):
 
 def exported(tables, place):
     """A complete scenario, whose defaults do not follow later changes, and its compiled controller."""
-    return scenario.reading.settled(program(tables, place).scenario), Library(place)
+    return scenario.reading.freeze_defaults(program(tables, place).scenario), Library(place)
 
 
 def changed(known, changes):
@@ -182,9 +182,10 @@ def test_a_value_that_c_cannot_derive_is_a_parameter_and_the_readme_reports_it()
     tables = {**FLIGHTS["raw"], "observer": {"kind": "custom", "code": f"{__file__}:Steepest"}}
     made = folder.Controller(scenario.reading.complete(scenario.from_tables(tables)), "flight", "flight")
     names = [field.name for field in made.code.parameters]
-    assert [name for name in made.code.fixed if name in names] == ["bound_rate"]  # three fields with the same number
-    assert {"inertia", "observer_disturbance_bound"} == set(made.code.follows["bound_rate"])
+    # the three fields of the bound have the same number
+    assert [name for name in made.code.underivable if name in names] == ["bound_rate"]
+    assert {"inertia", "observer_disturbance_bound"} == set(made.code.sources_of["bound_rate"])
     assert [field.name for field in made.code.derived] == ["inertia_inverse"]
-    said = readme(made.code, made.about)
+    said = readme(made.code, made.info)
     assert "| `bound_rate` | `inertia`, `observer_disturbance_bound` |" in said
     assert "`jnp.linalg.eigvalsh` (" in said

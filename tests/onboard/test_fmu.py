@@ -13,7 +13,7 @@ import pytest
 
 import ptsmc_jax as ptsmc
 from ptsmc_jax import scenario
-from ptsmc_jax.onboard import fmu as units
+from ptsmc_jax.onboard import fmu as fmu_files
 from ptsmc_jax.onboard import folder
 from ptsmc_jax.onboard.library import Library, compiler
 from ptsmc_jax.scenario.errors import ScenarioError
@@ -104,7 +104,7 @@ def library(tmp_path_factory):
     return Library(place)
 
 
-@pytest.fixture(scope="module", params=units.VERSIONS)
+@pytest.fixture(scope="module", params=fmu_files.VERSIONS)
 def loop(files, request):
     """Controller and plant of one version of FMI."""
     return tuple(Unit(files / f"{name}_fmi{request.param}.fmu") for name in ("controller", "plant"))
@@ -131,7 +131,7 @@ def test_closed_loop_of_fmus_equals_the_simulation(rich, expected, loop):
 
 def test_controller_has_the_outputs_of_the_exported_c(library, loop):
     controller, _ = loop
-    rows, state, columns = run(loop, 3), library.first(), library.columns
+    rows, state, columns = run(loop, 3), library.initial_state(), library.columns
     for name, value in rows[0][0].items():
         if name.startswith("initial_"):
             element = name.removeprefix("initial_").replace("[", " ").replace("]", "").split()
@@ -139,7 +139,7 @@ def test_controller_has_the_outputs_of_the_exported_c(library, loop):
     inputs = controller.names("input")
     for k, (readings, commands) in enumerate(rows):
         given = [k * controller.period, *(readings[name] for name in inputs)]
-        state, out, status = library.many(state, np.array(given))
+        state, out, status = library.step_many(state, np.array(given))
         found = np.array([v for name, v in commands.items() if name != "status"])
         assert found.tobytes() == out.tobytes()
         assert status == commands["status"]
@@ -260,7 +260,7 @@ def test_unusable_inputs_return_a_warning_and_the_last_command(loop):
 @pytest.mark.parametrize("model", [pytest.param("controller", marks=pytest.mark.long), "plant"])
 def test_sanitizers_find_nothing(rich, tmp_path, model):
     made = {"controller": folder.controller_model, "plant": folder.plant_model}[model](rich)
-    texts, token = units.sources(made, 3)
+    texts, token = fmu_files.source_texts(made, 3)
     for name, text in texts.items():
         (tmp_path / name).write_text(text)
     driver = str(ROOT / "tests" / "onboard" / "fmu_driver.c")
@@ -315,17 +315,17 @@ def test_plant_that_c_cannot_express_is_refused():
 
 def test_names_of_scenario_files_may_contain_quotes(rich):
     model = folder.controller_model(rich)._replace(title='controller of "a" & b.toml')
-    for version in units.VERSIONS:
-        described = ElementTree.fromstring(units.description(model, version, "token", []).encode())
+    for version in fmu_files.VERSIONS:
+        described = ElementTree.fromstring(fmu_files.model_description(model, version, "token", []).encode())
         assert described.attrib["modelName"] == model.title
 
 
 def test_units_are_products_of_base_units():
-    assert units.unit("N m s") == ("N.m.s", {"kg": 1, "m": 2, "s": -1})
-    assert units.unit("rad/s^2") == ("rad/s2", {"rad": 1, "s": -2})
-    assert units.unit("1/s") == ("1/s", {"s": -1})
-    assert units.unit("rad/s/sqrt(s)") is None
-    assert units.unit("-") is None
+    assert fmu_files.parse_unit("N m s") == ("N.m.s", {"kg": 1, "m": 2, "s": -1})
+    assert fmu_files.parse_unit("rad/s^2") == ("rad/s2", {"rad": 1, "s": -2})
+    assert fmu_files.parse_unit("1/s") == ("1/s", {"s": -1})
+    assert fmu_files.parse_unit("rad/s/sqrt(s)") is None
+    assert fmu_files.parse_unit("-") is None
 
 
 RANDOM = {**FLIGHTS["slew"], "dispersion": {"reference": {"kind": "normal", "std_deg": 3.0}}}

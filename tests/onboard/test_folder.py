@@ -16,7 +16,7 @@ import pytest
 import ptsmc_jax as ptsmc
 from ptsmc_jax import scenario
 from ptsmc_jax.onboard import folder, templates
-from ptsmc_jax.onboard.board import board
+from ptsmc_jax.onboard.board import build_board
 from ptsmc_jax.onboard.library import Library, compiler
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.law_tables import LAWS
@@ -240,17 +240,17 @@ def test_reference_as_an_input_replays_the_simulation(tmp_path):
         _, *rows = csv.reader(file)
     given = np.array([row[3 : 3 + len(library.columns["in"])] for row in rows[1:]], float)
     assert np.ptp(given[:, first + 2]) > 0.3
-    states, found = [library.first(), library.first()], []
+    states, found = [library.initial_state(), library.initial_state()], []
     for k, row in enumerate(given):
         other = row.copy()
         other[first : first + 4] *= (-1.0) ** k
         for j, one in enumerate((row, other)):
-            states[j], out, status = library.many(states[j], one)
+            states[j], out, status = library.step_many(states[j], one)
             found.append(out)
             assert status == 0
         assert found[-1].tobytes() == found[-2].tobytes()
     given[0, first : first + 4] = 0.1  # not a rotation
-    assert library.many(library.first(), given[0])[2] == 4
+    assert library.step_many(library.initial_state(), given[0])[2] == 4
 
 
 @needs_make
@@ -321,7 +321,8 @@ def test_exported_c_has_the_names_and_equations_of_the_law(exported):
 def test_singularity_limit_in_c_equals_that_of_the_simulator(monkeypatch):
     monkeypatch.setattr(run_state, "SINGULAR_DISTANCE", 0.0125)
     made = folder.Controller(scenario.from_tables(flight()), "short", "a scenario")
-    limits = re.findall(r"singularity_distance >= R\((.*?)\)", templates.texts(made.code, made.about)["ptsmc_short.c"])
+    code = templates.controller_texts(made.code, made.info)["ptsmc_short.c"]
+    limits = re.findall(r"singularity_distance >= R\((.*?)\)", code)
     assert limits == ["0.0125", "0.0125"]
 
 
@@ -334,7 +335,7 @@ def test_command_filter_advances_by_one_period_after_missed_samples():
              "before.singularity_distance_unit": 1.0, "last.command": np.ones(3), "last.s": np.zeros(3)}  # fmt: skip
 
     def commanded(simulated, gap):
-        made = board(simulated)
+        made = build_board(simulated)
         (stage,) = (one for one in made.stages if one.name == "command")
         read = {name: jax.tree.map(jnp.asarray, (known | {"dt": gap})[name]) for name in stage.reads}
         return np.asarray(stage.run(made.parameters, read)["out.command"])

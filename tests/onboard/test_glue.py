@@ -27,10 +27,10 @@ def exported(tmp_path_factory):
         done = subprocess.run(["make", target, "CFLAGS=-O0"], cwd=place, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
     library, rows = Library(place, options=("-O0",)), []
-    state = library.first()
+    state = library.initial_state()
     for k in range(SAMPLES):
         row = np.array([0.1 * k, 0.1, 0.2, -0.1, np.sqrt(0.94), 1e-3, -2e-3, 1e-4 * k])
-        state, out, status = library.many(state, row)
+        state, out, status = library.step_many(state, row)
         rows.append((row, out, int(status)))
     assert any(np.any(out != rows[0][1]) for _, out, _ in rows)
     return place, rows

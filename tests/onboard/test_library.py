@@ -17,7 +17,7 @@ from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.numerics import paths
 from ptsmc_jax.numerics.pytrees import pytree
 from ptsmc_jax.onboard import folder
-from ptsmc_jax.onboard.generate import names_of
+from ptsmc_jax.onboard.generate import column_names
 from ptsmc_jax.onboard.library import InTheLoop, Library
 from ptsmc_jax.onboard.templates import STATUS
 from ptsmc_jax.scenario.errors import ScenarioError
@@ -85,12 +85,12 @@ def given(made):
     one, none = np.ones_like(t), np.zeros_like(t)
     q = np.stack([np.sin(half), none, none, np.cos(half)], axis=1)
     columns = {"t": t, **{f"attitude[{k}]": q[:, k] for k in range(4)}, "attitude_valid": one, "rate[0]": 0.02 * one}
-    return np.stack([columns.get(name, none) for name in names_of(made.board)["in"]], axis=1)
+    return np.stack([columns.get(name, none) for name in column_names(made.board)["in"]], axis=1)
 
 
 def simulated(library, samples):
     """Statuses and outputs of a sequence of samples."""
-    return replayed(library, samples, library.first())[:2]
+    return replayed(library, samples, library.initial_state())[:2]
 
 
 def changed(library, samples, at, **values):
@@ -179,14 +179,14 @@ def test_an_invalid_attitude_is_not_used_in_computations(name, exported, tmp_pat
     (tmp_path / "watched.c").write_text(WATCHED)
     made, plain = exported(name)
     library = Library(plain.folder, options=(str(tmp_path / "watched.c"),))
-    setattr(library._made, "ptsmc_many", library._made.watched)  # noqa: B010
-    samples, names = given(made), names_of(made.board)["in"]
+    setattr(library._binary, "ptsmc_many", library._binary.watched)  # noqa: B010
+    samples, names = given(made), column_names(made.board)["in"]
     of_star = [k for k, column in enumerate(names) if column.startswith("attitude")]
     for at, said in ((10, 0.0), (15, np.nan), (20, 1e300)):
         samples[at, of_star] = said
         samples[at, names.index("attitude_valid")] = 0.0
     statuses, _ = simulated(library, samples)
-    assert library._made.raised() == 0
+    assert library._binary.raised() == 0
     assert not statuses.any()
 
 
@@ -194,8 +194,8 @@ def test_an_invalid_attitude_is_not_used_in_computations(name, exported, tmp_pat
 def test_the_age_of_an_attitude_is_clipped_to_the_period_and_must_not_be_nan(exported):
     """The star tracker has its own clock. A NaN age is invalid input only if there is an attitude."""
     made, library = exported("star tracker out of step")
-    samples, at = given(made), names_of(made.board)["in"].index("attitude_age")
-    valid = names_of(made.board)["in"].index("attitude_valid")
+    samples, at = given(made), column_names(made.board)["in"].index("attitude_age")
+    valid = column_names(made.board)["in"].index("attitude_valid")
     other = samples.copy()
     other[:, at] = 0.04  # the body turns at 0.02 rad/s
     turned = other.copy()
@@ -213,7 +213,7 @@ def test_the_age_of_an_attitude_is_clipped_to_the_period_and_must_not_be_nan(exp
 @needs_compiler
 def test_invalid_wheel_telemetry_is_invalid_input(exported):
     made, library = exported("wheels")
-    samples, at = given(made), names_of(made.board)["in"].index("wheel_momentum[2]")
+    samples, at = given(made), column_names(made.board)["in"].index("wheel_momentum[2]")
     for bad in (np.nan, np.inf, 1e9):
         other = samples.copy()
         other[10, at] = bad
@@ -239,7 +239,7 @@ def test_a_missed_sample_gives_a_status_and_does_not_update_the_observer(filtere
 @needs_compiler
 def test_a_singular_attitude_gives_the_last_valid_command(exported):
     made, library = exported("raw")
-    names = names_of(made.board)["in"]
+    names = column_names(made.board)["in"]
     angles = np.concatenate([np.linspace(2.9, np.pi, 11), np.linspace(np.pi, 2.9, 11)[1:]])
     samples = np.zeros((len(angles), len(names)))
     samples[:, 0] = 0.1 * np.arange(len(angles))
@@ -247,7 +247,7 @@ def test_a_singular_attitude_gives_the_last_valid_command(exported):
     samples[:, names.index("attitude[3]")] = np.cos(angles / 2.0)
     statuses, outputs = simulated(library, samples)
     assert statuses.tolist() == [OK] * 10 + [SINGULAR] + [OK] * 10  # singular if half the angle is near 90 deg
-    at = names_of(made.board)["out"].index("command[0]")
+    at = column_names(made.board)["out"].index("command[0]")
     np.testing.assert_array_equal(outputs[10, at : at + 3], outputs[9, at : at + 3])
 
 
@@ -261,7 +261,7 @@ def test_an_unknown_status_is_counted_as_other(exported, tmp_path):
     code.write_text(code.read_text().replace(last, "    return in->t > 2.0 ? 7 : in->t > 1.0 ? -1 : status;\n"))
     run = runs.simulate(made.ready, 3, 2, InTheLoop(Library(code.parent), made.ready.parts).software)
     late = int(np.sum(run.log.t[:-1] > 1.0))
-    assert (*map(str.lower, STATUS), "other") == computer.SAMPLES
+    assert (*map(str.lower, STATUS), "other") == computer.SAMPLE_STATUSES
     assert run.samples == {**dict.fromkeys(run.samples, 0), "ok": len(run.log.t) - 1 - late, "other": late}
 
 
@@ -271,19 +271,20 @@ def test_jax_calls_the_controller_without_python_callback(exported, precision):
     """A callback deadlocks with many trials on two devices, because it waits for busy threads to copy arrays."""
     made, library = exported("wheels")
     inputs = given(made)[:6].astype(precision)
-    states = np.repeat(library.first()[None], 6, axis=0).astype(precision)
+    states = np.repeat(library.initial_state()[None], 6, axis=0).astype(precision)
     told = np.full((6, library.parameters.size), np.nan, precision)
     told[3:, library.columns["params"].index("law_eta")] = 4.0
-    program = jax.jit(jax.vmap(jax.vmap(library.called))).lower(*(v.reshape(2, 3, -1) for v in (states, inputs, told)))
+    batched = jax.jit(jax.vmap(jax.vmap(library.step_in_jax)))
+    program = batched.lower(*(v.reshape(2, 3, -1) for v in (states, inputs, told)))
     assert library.target in program.as_text()
     assert "callback" not in program.as_text()
     found = program.compile()(*(v.reshape(2, 3, -1) for v in (states, inputs, told)))
-    wanted = library.many(states, inputs, told)
+    wanted = library.step_many(states, inputs, told)
     for one, other in zip(found, wanted, strict=True):
         assert one.dtype == (np.int32 if other.dtype == np.int32 else precision)
         np.testing.assert_array_equal(one, other.astype(one.dtype).reshape(one.shape))
     at = library.columns["out"].index("command[0]")
-    assert np.any(wanted[1][3:, at] != library.many(states, inputs)[1][3:, at])
+    assert np.any(wanted[1][3:, at] != library.step_many(states, inputs)[1][3:, at])
 
 
 @needs_compiler
@@ -345,19 +346,19 @@ def test_differences_of_small_parameters_are_reported(exported):
 def test_rows_of_other_types_are_converted_and_of_wrong_length_raise_an_error(filtered):
     """Otherwise C would read other numbers or write beyond the arrays."""
     library, samples = filtered
-    state, given, told = library.first(), samples[0], np.full(library.parameters.size, np.nan)
+    state, given, told = library.initial_state(), samples[0], np.full(library.parameters.size, np.nan)
     whole = np.rint(given).astype(int)
-    np.testing.assert_array_equal(library.called(state, whole, told)[1], library.many(state, whole)[1])
+    np.testing.assert_array_equal(library.step_in_jax(state, whole, told)[1], library.step_many(state, whole)[1])
     half = [v.astype(np.float16) for v in (state, given, told)]
-    after, out, _ = library.called(*half)
+    after, out, _ = library.step_in_jax(*half)
     assert after.dtype == out.dtype == np.float32
-    np.testing.assert_array_equal(out, library.many(*half)[1].astype(np.float32))
+    np.testing.assert_array_equal(out, library.step_many(*half)[1].astype(np.float32))
     for k in range(3):
         short = [v[: -1 if j == k else None] for j, v in enumerate((state, given, told))]
         with pytest.raises((TypeError, ValueError), match="reshape"):
-            library.called(*short)
+            library.step_in_jax(*short)
         with pytest.raises(ValueError, match=r"reshape|broadcast"):
-            library.many(*short)
+            library.step_many(*short)
 
 
 @pytree

@@ -9,7 +9,7 @@ import ptsmc_jax as ptsmc
 from ptsmc_jax.numerics import attitude
 from ptsmc_jax.onboard import folder, vectors
 from ptsmc_jax.onboard.library import Library
-from ptsmc_jax.simulation.computer import SAMPLES
+from ptsmc_jax.simulation.computer import SAMPLE_STATUSES
 from tests.onboard.compiled import needs_compiler, program, replayed
 from tests.onboard.flights import LAW, LOOP, SPREAD
 
@@ -39,7 +39,7 @@ TABLES = {
         {"kind": "gyro", "rate_noise": 1e-6, "rate_bias": 1e-5, "rate_bias_walk": 1e-8},
     ],
 }
-INPUT = SAMPLES.index("input")
+INPUT = SAMPLE_STATUSES.index("input")
 
 pytestmark = needs_compiler
 
@@ -61,7 +61,7 @@ def columns(library, name):
 def test_exported_c_with_a_suite_replays_the_simulation(suite):
     """Each sample starts from the simulated state. Outputs and states agree to 1e-12 of their peak."""
     library, given, out, states = suite
-    after, outputs, statuses = library.many(states[:-1], given)
+    after, outputs, statuses = library.step_many(states[:-1], given)
     assert not statuses.any()
     for kind, found, wanted in (("out", outputs, out), ("state", after, states[1:])):
         names = [column.partition("[")[0] for column in library.columns[kind]]
@@ -103,8 +103,8 @@ def test_the_first_star_tracker_reading_initialises_the_attitude(suite):
     begin = int(np.flatnonzero(given[:, columns(library, "star_tracker_2_valid")[0]])[0])
     none = given[: begin + 1].copy()
     none[:, [columns(library, name)[0] for name in ("star_tracker_1_valid", "star_tracker_2_valid")]] = 0.0
-    assert np.all(replayed(library, none, library.first())[0] == INPUT)
-    statuses, _, found = replayed(library, given[begin:], library.first())
+    assert np.all(replayed(library, none, library.initial_state())[0] == INPUT)
+    statuses, _, found = replayed(library, given[begin:], library.initial_state())
     assert not statuses.any()
     at = library.columns["state"].index("attitude[0]")
     off = Rotation.from_quat(states[1 + begin :, at : at + 4]).inv() * Rotation.from_quat(found[:, at : at + 4])

@@ -9,7 +9,7 @@ import pytest
 import scipy.special
 
 from ptsmc_jax.numerics import attitude, draws, elementary, guards, matrices
-from ptsmc_jax.onboard.fields import struct
+from ptsmc_jax.onboard.fields import struct_fields
 from ptsmc_jax.onboard.translate import NoRuleError
 from tests.onboard.compiled import body, both, needs_compiler
 
@@ -247,7 +247,7 @@ def test_random_keys_raise_an_error_as_constants_and_in_memories():
     with pytest.raises(NoRuleError, match=r"^a constant has the type key<fry>, but must have"):
         body(lambda x: x + jax.random.normal(key), X)
     with pytest.raises(NoRuleError, match=r"^law has the type key<fry>, but must have"):
-        struct({"law": jax.ShapeDtypeStruct((), key.dtype)}, {})
+        struct_fields({"law": jax.ShapeDtypeStruct((), key.dtype)}, {})
 
 
 @pytest.mark.parametrize("known", [jnp.asarray([1.0 + 2.0j, 2.0, 3.0]), jnp.asarray([1, 2, 3], jnp.uint64)])

@@ -152,13 +152,13 @@ def test_what_a_user_typed_is_text(simulated):
 
 def test_links_out_of_the_folder_and_other_files_than_pictures_are_not_embedded(command, simulated, tmp_path):
     """A page is made to be sent, and a folder may come from anybody."""
-    picture = page.PNG + b"secret"
+    picture = page.PNG_HEADER + b"secret"
     (tmp_path / "elsewhere.png").write_bytes(picture)
     (simulated / "figures" / "outside.png").symlink_to(tmp_path / "elsewhere.png")
     (simulated / "figures" / "gone.png").symlink_to(tmp_path / "not-there.png")
     (simulated / "figures" / "loop.png").symlink_to("loop.png")
     (simulated / "figures" / "key.png").write_text("secret")
-    (simulated / "inside.png").write_bytes(page.PNG + b"inside")
+    (simulated / "inside.png").write_bytes(page.PNG_HEADER + b"inside")
     (simulated / "figures" / "linked.png").symlink_to("../inside.png")
     code, _, error = command("report", "run")
     assert code == 0
@@ -166,7 +166,7 @@ def test_links_out_of_the_folder_and_other_files_than_pictures_are_not_embedded(
     assert [line.split()[1] for line in error.splitlines()] == omitted
     read = (simulated / "report.html").read_text()
     embedded = [base64.b64decode(data) for data in re.findall(r"data:image/png;base64,([^\"]*)", read)]
-    assert page.PNG + b"inside" in embedded
+    assert page.PNG_HEADER + b"inside" in embedded
     assert not any(b"secret" in content for content in embedded)
 
 

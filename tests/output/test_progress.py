@@ -10,13 +10,13 @@ import pytest
 from ptsmc_jax import programs
 from ptsmc_jax.campaigns import campaign
 from tuning.output import progress, terminal
-from tuning.output.progress import Lines
+from tuning.output.progress import ProgressLines
 from tuning.output.report import Table
 
 
 def test_a_line_comes_also_while_nothing_new_is_said(capsys, monkeypatch):
     """The last line is repeated with the elapsed time, for example while a law is compiled for minutes."""
-    monkeypatch.setattr(progress, "EVERY", 0.05)
+    monkeypatch.setattr(progress, "INTERVAL", 0.05)
     with progress.Progress(quiet=False) as tell:  # the tests' output is no terminal
         tell("pd: compiling", 0, 0)
         time.sleep(0.4)
@@ -58,14 +58,14 @@ def unread():
 def test_a_reader_that_has_read_enough_changes_nothing(unread, monkeypatch):
     """As `head`: rich would exit with 1, which is the status of requirements that are not met."""
     monkeypatch.setattr("sys.stdout", unread)
-    terminal.say("told", "to nobody")
-    terminal.table(Table(("head",), [("row",)]))
+    terminal.print_lines("told", "to nobody")
+    terminal.print_table(Table(("head",), [("row",)]))
 
 
 def test_progress_that_nobody_reads_stops_nothing(unread, monkeypatch):
     monkeypatch.setattr("sys.stderr", unread)
-    monkeypatch.setattr(progress, "EVERY", 0.01)
-    with Lines(silent=False) as tell:
+    monkeypatch.setattr(progress, "INTERVAL", 0.01)
+    with ProgressLines(silent=False) as tell:
         tell("searching", 1, 7)
         time.sleep(0.1)  # an error of its thread would be a warning, which fails the test
 
@@ -75,7 +75,7 @@ def test_a_narrow_terminal_cuts_no_numbers(capsys, monkeypatch):
     monkeypatch.setenv("FORCE_COLOR", "1")  # a terminal
     monkeypatch.setenv("COLUMNS", "40")
     row = ("peak_torque_delivered", "0.000194", "0.000382..0.00102", "N m s", "largest delivered torque about one axis")
-    terminal.table(Table(("metric", "median", "its 95 % interval", "unit", "meaning"), [row]))
+    terminal.print_table(Table(("metric", "median", "its 95 % interval", "unit", "meaning"), [row]))
     out = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
     assert all(cell in out for cell in row[:4])
     assert "…" not in out
@@ -85,8 +85,8 @@ def test_a_narrow_terminal_cuts_no_numbers(capsys, monkeypatch):
 
 def test_terminal_prints_text_as_it_is(capsys):
     """Rich would print `:x:` in the name of a folder as an emoji, and [bold] not at all."""
-    terminal.say("results in out/tune:x:/[bold]")
-    terminal.table(Table(("a:key:",), [("b:x:[bold]",)]))
+    terminal.print_lines("results in out/tune:x:/[bold]")
+    terminal.print_table(Table(("a:key:",), [("b:x:[bold]",)]))
     out = capsys.readouterr().out
     assert "out/tune:x:/[bold]" in out
     assert "a:key:" in out
@@ -94,7 +94,7 @@ def test_terminal_prints_text_as_it_is(capsys):
 
 
 def test_a_compilation_that_a_step_waits_for_is_named(capsys, monkeypatch):
-    monkeypatch.setattr(progress, "EVERY", 0.02)
+    monkeypatch.setattr(progress, "INTERVAL", 0.02)
     monkeypatch.setattr(programs, "compiling", lambda: "compiling the gradients, 2 of 3")
     with progress.Progress(quiet=False) as tell:
         tell("searching", 1, 7)

@@ -13,7 +13,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from ptsmc_jax.campaigns.store import plain
+from ptsmc_jax.campaigns.store import to_json_value
 from ptsmc_jax.numerics import statistics
 from ptsmc_jax.simulation.catalogues import MARGINS
 from ptsmc_jax.simulation.requirements import Requirement
@@ -71,7 +71,7 @@ def earlier(metric: str) -> dict[str, Any]:
 
 
 def advice(verdict: dict[str, Any], **search: Any) -> Iterable[str]:
-    return tune_report.advice(
+    return tune_report.advice_lines(
         examples.tune({"largest_over_limit": {verdict["metric"]: 0.99}, **search}, verdicts=[verdict])
     )
 
@@ -94,7 +94,7 @@ def looks(count: int) -> Iterable[str]:
     """Return the report of a search after this number of looks at held-out trials, each at 95 % confidence."""
     asked = Requirement("peak_torque", 0.5, quantile=0.9, confidence=0.95)
     found = {"earlier": (count - 1) * [earlier("peak_torque")], "margins": {"peak_torque": 0.05}}
-    return tune_report.search(
+    return tune_report.search_lines(
         examples.tune(found, verdicts=[asked.verdict(np.zeros(1000), np.ones(1000, bool)).in_summary()])
     )
 
@@ -102,18 +102,18 @@ def looks(count: int) -> Iterable[str]:
 def conflict(**limits: float | None) -> Iterable[str]:
     found = {"largest_over_limit": {"peak_torque": 1.12, "gain_margin": 1.119}, "conflict": limits,
              "searched_globally": True}  # fmt: skip
-    return tune_report.search(examples.tune(found, verdicts=[examples.torque(1.1), MARGIN]))
+    return tune_report.search_lines(examples.tune(found, verdicts=[examples.torque(1.1), MARGIN]))
 
 
 def skipped(reached: float, **changes: Any) -> Iterable[str]:
     """Return the report of a search that does not confirm a quantile if it exceeds a limit by more than a tenth."""
     asked = Requirement("effort", 9.0, quantile=0.9).verdict(np.zeros(10), np.ones(10, bool)).in_summary()
     found = {"largest_over_limit": {"peak_torque": reached, "effort": 0.5}}
-    return tune_report.search(examples.tune(found, verdicts=[examples.torque(1.2), {**asked, **changes}]))
+    return tune_report.search_lines(examples.tune(found, verdicts=[examples.torque(1.2), {**asked, **changes}]))
 
 
 def accuracy(times: float | None, **changes: Any) -> Iterable[str]:
-    return tune_report.accuracy(examples.tune(accuracy_gain_over_published=times, **changes))
+    return tune_report.accuracy_lines(examples.tune(accuracy_gain_over_published=times, **changes))
 
 
 def shortest(theory: float | None, simulated: float | None, quantile: float | None = None) -> Any:
@@ -122,25 +122,25 @@ def shortest(theory: float | None, simulated: float | None, quantile: float | No
 
 
 def diagnostics(at_bound: dict[str, str] | None = None, **trust: Any) -> Iterable[str]:
-    return tune_report.diagnostics(examples.tune(trust=trust, at_bound=at_bound or {}))
+    return tune_report.diagnostic_lines(examples.tune(trust=trust, at_bound=at_bound or {}))
 
 
 def gains_by_axis(**tuned: float) -> Table:
     paper = examples.group(gains={"observer_gain": 10.0})
-    return tune_report.gains(examples.tune(plant="chain", published=paper, held_out=examples.group(gains=tuned)))
+    return tune_report.gain_table(examples.tune(plant="chain", published=paper, held_out=examples.group(gains=tuned)))
 
 
 def fitted(least: float) -> Iterable[str]:
     """Return the advice for an RMS of 1.49 to 2.01 in 16 training trials, and from `least` on in held-out trials."""
     at = {"training": (1.49, 2.01), "held_out": (least, 2.48)}
     groups = {on: examples.group(window_error=errors(1.0, interval)) for on, interval in at.items()}
-    return tune_report.advice(examples.tune({"averaged": 16}, **groups))
+    return tune_report.advice_lines(examples.tune({"averaged": 16}, **groups))
 
 
 def margins_of(required: bool = False, **ends: dict[str, Any]) -> Iterable[str]:
     known = {"stable": True, "gain_margin": 6.0, "phase_margin": 30.0, "delay_margin": 0.1, "peak_sensitivity": 5.0}
     loops = {name: summaries.read(summaries.Left, {**known, **changes}) for name, changes in ends.items()}
-    return margins_report.tuned(loops, required=required)
+    return margins_report.tuned_margin_lines(loops, required=required)
 
 
 FEW = {"gain_margin": 5.9, "phase_margin": 0.0, "peak_sensitivity": 7.0}
@@ -154,17 +154,17 @@ TUNINGS: dict[str, Callable[[], Any]] = {
     "tuned, a trial of a chain fails": lambda: tune_report.build(
         examples.tune(held_out=HELD_OUT, plant="chain", status="not met")
     ),
-    "held-out trials break a limit": lambda: tune_report.advice(broken(1.1)),
-    "held-out trials fail": lambda: tune_report.advice(broken(None)),
-    "held-out trials keep the limit": lambda: tune_report.advice(broken(0.9)),
-    "the search broke the limit too": lambda: tune_report.advice(broken(1.1, searched=1.2)),
+    "held-out trials break a limit": lambda: tune_report.advice_lines(broken(1.1)),
+    "held-out trials fail": lambda: tune_report.advice_lines(broken(None)),
+    "held-out trials keep the limit": lambda: tune_report.advice_lines(broken(0.9)),
+    "the search broke the limit too": lambda: tune_report.advice_lines(broken(1.1, searched=1.2)),
     "a fraction of the time of each run": lambda: advice_on_time("temporal"),
     "a fraction of the time of all runs": lambda: advice_on_time("mixed"),
     "held-out loops break a gain margin": lambda: advice_on_margin("gain_margin", 6.0, 5.2),
     "held-out loops break a peak sensitivity": lambda: advice_on_margin("peak_sensitivity", 6.0, 7.5),
     "held-out loops have no phase margin": lambda: advice_on_margin("phase_margin", 30.0, 0.0),
     # 4.8 dB of 6 dB are 0.8 times the limit, although `violation_ratio` is 1.2
-    "margins relative to their limits": lambda: tune_report.search(
+    "margins relative to their limits": lambda: tune_report.search_lines(
         examples.tune(
             {"largest_over_limit": {"gain_margin": 1.2}, "margins": {"gain_margin": 0.05},
              "earlier": [earlier("gain_margin")]},
@@ -185,11 +185,11 @@ TUNINGS: dict[str, Callable[[], Any]] = {
     "all held-out trials fail": lambda: accuracy(
         0.08, held_out=examples.group(counts={"ok": 0, "not_converged": 60, "diverged": 4})
     ),
-    "all but two training trials fail": lambda: tune_report.search(
+    "all but two training trials fail": lambda: tune_report.search_lines(
         examples.tune({"largest_over_limit": {"peak_torque": None, "effort": None, "chattering": math.inf}},
                       training=examples.group(trials=16, counts={"ok": 2, "not_converged": 14}))
     ),
-    "no gains meet a limit": lambda: tune_report.search(broken(1.2, searched=1.234)),
+    "no gains meet a limit": lambda: tune_report.search_lines(broken(1.2, searched=1.234)),
     "a torque limit may give way": lambda: conflict(peak_torque=1.3),
     "a margin may give way": lambda: conflict(gain_margin=1.25),
     "a margin cannot give way": lambda: conflict(gain_margin=2.5),
@@ -230,7 +230,7 @@ def front(*points: Point, **changes: Any) -> Front:
         "seed": 1, "interval_confidence": 0.95, "lower_bound": None, "rollouts": 1, "gradients": 1, "requirements": [],
         "gain_units": {"eta": "-", "observer_gain": "kg m^2/s"}, "warnings": [], "published_label": "published",
     }  # fmt: skip
-    return read(plain(Front(**known | changes).summary()))
+    return read(to_json_value(Front(**known | changes).summary()))
 
 
 def torque(limit: float, peak: float, rms: float, gains: Any = (("eta", 3.0),), **changes: Any) -> Point:
@@ -291,18 +291,18 @@ def fractions() -> Iterable[str]:
     found = examples.entry(verdict, fraction=59 / 60, fraction_interval=[0.91056, 0.99957], fraction_bound=0.92333)
     wide = Requirement("ape_x", 1.0, quantile=0.9, interpretation="mixed")
     seen = wide.verdict(np.ones(3), np.ones(3, bool), np.array([1.0, 0.95, 1.0]))
-    return campaign_report.verdict(found), str(examples.entry(seen))
+    return campaign_report.verdict_with_fraction(found), str(examples.entry(seen))
 
 
 def settling(without: int) -> Iterable[Table]:
     """Return the quantiles if some trials never settled, of which one failed."""
     times = {"without_value": without, "max": 57.2, "0.5": AT, "0.9973": AT}
     counts = {"ok": 58, "not_converged": 1, "diverged": 1}
-    return campaign_report.quantiles(examples.campaign(counts=counts, quantiles={"settling_time": times}))
+    return campaign_report.quantile_tables(examples.campaign(counts=counts, quantiles={"settling_time": times}))
 
 
 def campaign_gains(**tables: dict[str, Any]) -> Table:
-    return campaign_report.gains(tables, "spacecraft")
+    return campaign_report.gain_table(tables, "spacecraft")
 
 
 def pairs(count: int) -> Iterable[str]:
@@ -313,7 +313,7 @@ def pairs(count: int) -> Iterable[str]:
         {**pair, "x": 2.0, "y": 1.0, "not_converged": 2.0, "window_error": 1e-6},
         {**pair, "x": 2.0, "y": 2.0, "status": "not allowed", "window_error": math.nan},
     ]
-    return map_report.lines(every[:count], ("loop.period", "controller.delta"), "spacecraft")
+    return map_report.summary_lines(every[:count], ("loop.period", "controller.delta"), "spacecraft")
 
 
 def compared() -> Table:
@@ -322,7 +322,7 @@ def compared() -> Table:
         return examples.law(window_error=1e-5, verdicts=[verdict.in_summary()], met=verdict.met, **changes)
 
     laws = examples.compare({"pd": law(12), "prescribed_time": law(0, lower_bound=6.6e-9)}).laws
-    return compare_report.table(compare_report.QUESTIONS[0], laws)
+    return compare_report.answer_table(compare_report.QUESTIONS[0], laws)
 
 
 def budget(simulated: int, ok: int, not_converged: int = 0) -> str:
@@ -330,13 +330,13 @@ def budget(simulated: int, ok: int, not_converged: int = 0) -> str:
     told = {"after": 0.0, "boresight": [1.0, 0.0, 0.0], "probability": 0.9973, "confidence": 0.95, "window": 1.0,
             "budget": {"ape": {"x": None}}}  # fmt: skip
     counts = {"ok": ok, "not_converged": not_converged}
-    return [*pointing_report.heading(examples.campaign(pointing=told, simulated=simulated, counts=counts))][-1]
+    return [*pointing_report.heading_lines(examples.campaign(pointing=told, simulated=simulated, counts=counts))][-1]
 
 
 def winner(least: float) -> str:
     errors = {"pd": least, "prescribed_time": 4e-6}
     laws = examples.compare({name: examples.law(window_error=error) for name, error in errors.items()}).laws
-    return compare_report.winner(laws)
+    return compare_report.most_accurate_law(laws)
 
 
 def run(lower_bound: float | None) -> Report:
@@ -359,7 +359,7 @@ def why(*rows: dict[str, Any], **changes: Any) -> Iterable[str]:
     """Return the reasons of a trial. Each row is an input, in which a category has a fraction of equal trials."""
     alike = {"metric": "effort", "trial": 3, "value": None, "drawn": 2.0, "unit": "", "fraction": None, "median": 1.0,
              "percentile": None, "rank_correlation": None, "first_order": None, **changes}  # fmt: skip
-    return trials_report.why([{**alike, **row} for row in rows], "spacecraft")
+    return trials_report.explanation_lines([{**alike, **row} for row in rows], "spacecraft")
 
 
 OTHERS: dict[str, Callable[[], Any]] = {
@@ -378,8 +378,8 @@ OTHERS: dict[str, Callable[[], Any]] = {
     ),
     # its class may have another unit than a built-in k
     "gains of a custom law": lambda: campaign_gains(controller={"kind": "custom", "t_f": 30.0, "k": 2.0}),
-    "how to replay a trial": lambda: trials_report.how_to_replay(
-        pl.DataFrame({"trial": [7], "window_error": [0.1]}), Path("my out"), custom=True
+    "how to replay a trial": lambda: trials_report.replay_hint(
+        pl.DataFrame({"trial": [7], "window_error": [0.1]}), Path("my out"), is_custom=True
     ),
     "best pair of a map": lambda: pairs(4),
     "one pair of a map": lambda: pairs(1),
@@ -451,11 +451,11 @@ def test_chart_shows_the_smallest_lower_bound_and_a_required_limit():
     asked = examples.law(verdicts=[examples.torque(0.9)])
     found = list(examples.compare({str(k): law for k, law in enumerate([*laws, asked])}).laws.values())
     accuracy, torque, *_ = compare_report.QUESTIONS
-    (level,) = compare_report.marks(accuracy, found).values()
+    (level,) = compare_report.reference_lines(accuracy, found).values()
     np.testing.assert_allclose(level, 2e-6 * 180 * 3600 / np.pi)  # arcsec
-    assert compare_report.marks(accuracy, found[2:]) == {}
-    assert compare_report.marks(torque, found[:3]) == {}
-    assert compare_report.marks(torque, found) == {"limit": 0.5}
+    assert compare_report.reference_lines(accuracy, found[2:]) == {}
+    assert compare_report.reference_lines(torque, found[:3]) == {}
+    assert compare_report.reference_lines(torque, found) == {"limit": 0.5}
 
 
 NO_DRIVER = "no dispersed quantity alone explains 5 % of the variance of the ranks of window_error"
@@ -463,7 +463,7 @@ NO_DRIVER = "no dispersed quantity alone explains 5 % of the variance of the ran
 
 def driver_lines(drivers, trials):
     found = {"drivers": {"window_error": drivers}, "driver_trials": {"window_error": trials}}
-    return list(campaign_report.drivers(examples.campaign(simulated=10_000, trials=10_000, **found)))
+    return list(campaign_report.driver_lines(examples.campaign(simulated=10_000, trials=10_000, **found)))
 
 
 def test_chance_is_no_driver():
@@ -493,4 +493,4 @@ if __name__ == "__main__":
 def test_a_list_of_sensors_has_no_gains():
     law = {"controller": {"kind": "prescribed_time", "eta": 3.0}}
     sensors = {"sensors": [{"kind": "star_tracker"}, {"kind": "gyro"}]}
-    assert campaign_report.gains({**law, **sensors}, "spacecraft") == campaign_report.gains(law, "spacecraft")
+    assert campaign_report.gain_table({**law, **sensors}, "spacecraft") == campaign_report.gain_table(law, "spacecraft")

@@ -102,7 +102,7 @@ def test_each_figure_has_the_number_and_the_content_of_the_paper(monkeypatch):
     monkeypatch.setattr(reproduction.run_plots, "torque", lambda run, log, title: ("torque", log, title))
     monkeypatch.setattr(reproduction.run_plots, "state", lambda run, log, chart, title: (chart.name, log, title))
     monkeypatch.setattr(reproduction.run_plots, "convergence", lambda run, log, title: ("convergence", log, title))
-    monkeypatch.setattr(reproduction, "_observers", lambda measured: "observers")
+    monkeypatch.setattr(reproduction, "_plot_observers", lambda measured: "observers")
 
     def run(name: str) -> Any:
         plant = Spacecraft if name.startswith("case") else Chain

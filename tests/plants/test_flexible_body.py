@@ -97,7 +97,7 @@ def test_default_steps_keep_modes_accurate_to_a_millionth_for_given_torques(simu
         def period(x, now):
             t, t_next, u = now
             drive, _ = actuators.command(actuators.begin(3), u, x.w, t, t_next - t, jnp.ones(()))
-            x = control_period.PeriodMotion(made, t, x, drive, None).at(t_next)
+            x = control_period.PeriodMotion(made, t, x, drive, None).state_at(t_next)
             return x, x
 
         return jax.lax.scan(period, x, (t[:-1], t[1:], u[:-1]))[1]
@@ -173,7 +173,7 @@ def test_a_free_undamped_mode_has_the_frequency_of_the_formula():
     np.testing.assert_allclose(float(x.modes.e[0]), 0.1, rtol=1e-6)  # no decay
     from ptsmc_jax import formulas
 
-    np.testing.assert_allclose(formulas.free_modes(np.diag(J), [W], [[d, 0.0, 0.0]]), [omega], rtol=1e-12)
+    np.testing.assert_allclose(formulas.free_mode_frequencies(np.diag(J), [W], [[d, 0.0, 0.0]]), [omega], rtol=1e-12)
 
 
 def test_a_random_inertia_changes_the_rigid_rest_and_impossible_bodies_are_marked():

@@ -113,7 +113,7 @@ def test_a_rotation_of_more_than_a_radian_per_step_is_too_fast(dt):
     body, still = rigid_body.spacecraft(PAPER_INERTIA), vector([0.0, 0.0, 0.0, 1.0])
     for turn, too_fast in ((0.99, False), (1.01, True)):
         w = turn / dt * vector([0.6, 0.0, -0.8])
-        assert bool(body.too_fast(rigid_body.AttitudeState(still, w), vector(dt))) == too_fast
+        assert bool(body.is_too_fast(rigid_body.AttitudeState(still, w), vector(dt))) == too_fast
 
 
 def test_normalise_changes_only_the_norm():
@@ -252,7 +252,7 @@ def test_the_input_for_an_acceleration_and_the_unexplained_torque_are_consistent
     x_dot = plant.rate(t, x, u, vector(d))
     unit = 100 * EPS * np.linalg.norm(plant.inertia)  # rounding of about ten sums of such numbers
     np.testing.assert_allclose(plant.velocity(x_dot), w_dot, rtol=0, atol=unit)
-    np.testing.assert_allclose(plant.unexplained(t, x, x_dot, u), d, rtol=0, atol=unit)
+    np.testing.assert_allclose(plant.implied_disturbance(t, x, x_dot, u), d, rtol=0, atol=unit)
 
 
 def test_only_indices_out_of_range_are_reported():

@@ -75,7 +75,7 @@ torque = jax.jit(commanded)
 def looked_at(model, t, x, u):
     """Return dF/dx_2, acceleration without force, mass matrix and generalised force of a system."""
     force = model.generalised_force(t, x, u)
-    return model.slope(t, x), model.coasting_acceleration(t, x), model.mass(t, x), force
+    return model.rate_jacobian(t, x), model.coasting_acceleration(t, x), model.mass(t, x), force
 
 
 @pytest.mark.parametrize("hold", [False, True])
@@ -435,7 +435,7 @@ def test_a_written_system_from_python_cannot_be_read(tmp_path):
     store.write_toml(tmp_path / "s.toml", parsing.dump(made))
     with pytest.raises(ScenarioError, match=r'^plant\.system is "<System made in Python>": it names nothing'):
         scenario.read(tmp_path / "s.toml")
-    assert store.previous(tmp_path, parsing.dump(made), {"command": "tune", "seed": 0}) is None
+    assert store.read_previous_summary(tmp_path, parsing.dump(made), {"command": "tune", "seed": 0}) is None
 
 
 def test_steps_follow_the_run_with_the_shortest_t_f_of_a_search(monkeypatch):
@@ -445,12 +445,12 @@ def test_steps_follow_the_run_with_the_shortest_t_f_of_a_search(monkeypatch):
         "loop": {"mode": "sampled", "period": 0.05, "t_end": 13.0},
         "tune": {"free": ["t_f", "eta"], "bounds": {"t_f": [0.5, 4.0]}},
     }
-    looked_at, visited = [], solutions.visited
+    looked_at, visited = [], solutions.visited_states
 
     def spied(parts):
         looked_at.append((float(parts.controller.t_f), float(parts.t_end)))
         return visited(parts)
 
-    monkeypatch.setattr(solutions, "visited", spied)
-    posing.tuning_problem(scenario.from_tables(tables), 0)
+    monkeypatch.setattr(solutions, "visited_states", spied)
+    posing.set_up_tuning(scenario.from_tables(tables), 0)
     assert looked_at == [(0.5, 10.5)]

@@ -9,7 +9,7 @@ from ptsmc_jax.scenario import systems
 def here(tmp_path, monkeypatch, request):
     """An empty folder with the `FILES` of the test module; no custom file counts as run yet."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(systems, "_ran", {})
+    monkeypatch.setattr(systems, "_executed_files", {})
     for name, text in request.module.FILES.items():
         (tmp_path / name).write_text(text)
     return tmp_path

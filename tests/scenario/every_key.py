@@ -60,7 +60,7 @@ def complete(plant):
 
     The scenario around the table is sampled and has the noises and limits that dispersions need.
     """
-    text = new.text(plant, {})
+    text = new.scenario_text(plant, {})
     found, written = blocks(text), tomllib.loads(text)
     hardware = values(found["hardware"])
     for key in ("rate_noise_density", "star_tracker_every", "star_tracker_period"):  # exclude rate_noise, need a filter

@@ -125,8 +125,8 @@ MESSAGES = {
 def test_messages_in_every_style_give_the_same_attitudes(tmp_path, text, quaternions):
     samples = read(tmp_path / "attitude.aem", text)
     check(samples, quaternions)
-    if samples.ends is not None:
-        np.testing.assert_allclose(samples.ends, np.deg2rad(RATE[:2]), atol=1e-12)
+    if samples.end_rates is not None:
+        np.testing.assert_allclose(samples.end_rates, np.deg2rad(RATE[:2]), atol=1e-12)
 
 
 def test_segments_are_chosen_by_the_epoch_and_not_joined(tmp_path):
@@ -214,14 +214,14 @@ def test_relative_paths_start_at_the_scenario_file(tmp_path):
 
 def test_written_messages_are_read_back_with_equal_numbers(tmp_path):
     rates = np.deg2rad(RATE)
-    text = aem.write("SAT", TIMES, S, rates, "2026-03-20T12:00:00")
-    found = aem.segment(text)
+    text = aem.format_message("SAT", TIMES, S, rates, "2026-03-20T12:00:00")
+    found = aem.read_segment(text)
     assert found.rates is not None
     np.testing.assert_array_equal(found.quaternions, S)
     np.testing.assert_allclose(found.rates, rates, rtol=1e-15)
     np.testing.assert_allclose(found.times, TIMES, atol=1e-12)
     assert "QUATERNION_TYPE = LAST" in text
-    assert found.until == TIMES[-1]
+    assert found.usable_until == TIMES[-1]
 
 
 @pytest.mark.parametrize("text", ["2026-03-20T12:00:00", "2026-03-20T12:00:00.000000000125Z", "2024-366T23:59:59.5"])

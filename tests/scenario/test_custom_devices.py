@@ -169,7 +169,7 @@ def test_margins_with_a_late_star_tracker_lie_between_no_delay_and_full_delay():
     sensors = {"kind": "custom", "code": LateStarTracker}
     late = scenario.replace(flight, hardware=None, sensors=sensors)
     all_late = scenario.replace(flight, hardware__delay=LateStarTracker.late)
-    judged = [stability.worst(scenario.study(one)) for one in (all_late, late, flight)]
+    judged = [stability.worst_margins(scenario.study(one)) for one in (all_late, late, flight)]
     left = [one["hold"] for one in judged if one is not None]
     for margin in ("gain_margin", "phase_margin"):
         least, with_delay, most = (found[margin] for found in left)
@@ -180,7 +180,7 @@ def test_custom_dispersions_change_the_parts_and_appear_in_the_rows(command, her
     tables = {**CHAIN, "disturbance": {"kind": "sinusoid", "amplitude": [0.05]}, "dispersion": DRIFT}
     ready = scenario.study(scenario.from_tables(tables))
     assert ready.dispersion.varies
-    assert margin_verdicts.differ(ready.dispersion)
+    assert margin_verdicts.has_different_loops(ready.dispersion)
     c = ready.dispersion.coordinates(jnp.uint32(2), jnp.uint32(5))[CUSTOM]
     drawn = ready.dispersion.apply(ready.parts, jnp.uint32(2), jnp.uint32(5))
     np.testing.assert_allclose(drawn.disturbance.amplitude, 0.05 * (1.0 + 0.1 * c[0]), rtol=1e-15)
@@ -200,8 +200,8 @@ def test_custom_dispersions_change_the_parts_and_appear_in_the_rows(command, her
 
 def test_keys_of_custom_sensors_and_dispersions_are_read_and_written(here):
     loaded = scenario.from_tables({**CHAIN, "sensors": {**NOISY, "sigma": [1.0, 2.0]}, "dispersion": DRIFT})
-    assert custom.waits(loaded)
-    assert set(custom.programs(loaded)) == {"sensors.code", "dispersion.custom.code"}
+    assert custom.has_unloaded_code(loaded)
+    assert set(custom.code_by_key(loaded)) == {"sensors.code", "dispersion.custom.code"}
     assert set(custom.checksums(loaded)) == {"sensors_sha256", "dispersion_custom_sha256"}
     whole = reading.complete(loaded)
     assert whole.dispersion is not None
@@ -285,7 +285,7 @@ def test_gains_of_custom_sensors_are_tuned_and_written():
     assert gains.units_of(loaded)["sensors_share"] == "-"
     other = gains.in_scenario(loaded, {"sensors_share": 0.3})
     assert other.sensors.share == 0.3
-    assert gains.differ(loaded, other)
+    assert gains.controls_differ(loaded, other)
     one, two = (
         rollout.simulate_parts(p, 1, 2).metrics.window_error
         for p in (gains.with_gains(parts, {"sensors_share": 0.3}), scenario.study(other).parts)

@@ -15,7 +15,7 @@ import ptsmc_jax as ptsmc
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.laws.base import Sample
-from ptsmc_jax.onboard.board import board
+from ptsmc_jax.onboard.board import build_board
 from ptsmc_jax.scenario import custom, parsing, reading, systems
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
@@ -54,7 +54,7 @@ pytestmark = pytest.mark.usefixtures("here")
 
 def made(file, name) -> Any:
     """Load an object from a file of the test."""
-    return systems.item(f"{file}:{name}", systems.WHERE)
+    return systems.load_object(f"{file}:{name}", systems.NAME_FORMS)
 
 
 def simulated(tables, record=True):
@@ -93,13 +93,13 @@ def test_reading_runs_no_code_and_completing_finds_keys_gains_and_bounds():
     (systems.Path("mine.py")).write_text(HEAD + "raise RuntimeError('was run')\n" + LAW)
     tables = {**CHAIN, "controller": {**MINE, "k1": 2}, "tune": {"trials": 8}}
     loaded = scenario.from_tables(tables)
-    assert custom.waits(loaded)
+    assert custom.has_unloaded_code(loaded)
     assert parsing.dump(loaded)["controller"]["k1"] == 2
     with pytest.raises(ScenarioError, match=r"controller\.code is .* running mine\.py fails: RuntimeError"):
         reading.complete(loaded)
     (systems.Path("mine.py")).write_text(HEAD + LAW)
     whole = reading.complete(loaded)
-    assert not custom.waits(whole)
+    assert not custom.has_unloaded_code(whole)
     assert reading.complete(whole) is whole
     assert whole.controller.k1 == 2.0
     assert whole.controller.eta == 3.0
@@ -130,7 +130,7 @@ def test_a_scenario_with_custom_code_can_be_pickled_before_and_after_the_code_ru
     for read in (waits, reading.complete(waits)):
         again = pickle.loads(pickle.dumps(read))
         assert again == read
-        assert custom.waits(again) == custom.waits(read)
+        assert custom.has_unloaded_code(again) == custom.has_unloaded_code(read)
 
 
 def test_custom_gains_can_be_set_in_parts_and_in_the_scenario():
@@ -150,7 +150,7 @@ def test_custom_gains_can_be_set_in_parts_and_in_the_scenario():
     assert gains.gains_of(moved) == {
         "delta": 0.5, "m": 1.0, "k1": 0.25, "k": 1e-3, "observer_rate": 3.5, "t_f": 5.0,
     }  # fmt: skip
-    assert gains.present_values(moved, gains.named(whole)) == [0.5, 1.0, 0.25, 1e-3, 3.5]
+    assert gains.present_values(moved, gains.free_gain_names(whole)) == [0.5, 1.0, 0.25, 1e-3, 3.5]
     written = gains.in_scenario(whole, {"m": 2.0, "observer_rate": 4.0})
     assert (written.controller.m, written.observer.rate) == (2.0, 4.0)
     assert gains.units_of(whole)["observer_rate"] == "1/s"
@@ -435,7 +435,7 @@ def test_a_file_that_names_a_class_from_python_cannot_be_read(here):
 
 def test_late_errors_in_custom_code_are_one_sentence(command, here, monkeypatch):
     """JAX finds a traced number in a list during the run. The error names the custom file."""
-    monkeypatch.setattr(systems, "_files", set())
+    monkeypatch.setattr(systems, "_executed_paths", set())
     kept = LAW.replace("        left =", "        kept.append(error)\n        error = kept[-4:][0]\n        left =")
     (here / "mine.py").write_text(HEAD + "kept = []\n\n\ndef fails():\n    return 1 / 0\n" + kept)
     (here / "s.toml").write_text(SHORT_CUSTOM)
@@ -447,13 +447,13 @@ def test_late_errors_in_custom_code_are_one_sentence(command, here, monkeypatch)
     assert not (here / "out").exists()
     with pytest.raises(ZeroDivisionError) as caught:
         made("mine.py", "fails")()
-    assert systems.at_fault(caught.value) == str(here / "mine.py")
+    assert systems.find_faulty_file(caught.value) == str(here / "mine.py")
     with pytest.raises(ZeroDivisionError) as caught:
         raise ZeroDivisionError
-    assert systems.at_fault(caught.value) is None
+    assert systems.find_faulty_file(caught.value) is None
     with pytest.raises(ValueError, match="JVP") as no_slopes:  # as in a search: the traceback contains only JAX
         jax.jvp(lambda x: jax.pure_callback(lambda x: x, x, x), (1.0,), (1.0,))
-    assert systems.at_fault(no_slopes.value) == str(here / "mine.py")
+    assert systems.find_faulty_file(no_slopes.value) == str(here / "mine.py")
 
 
 def test_custom_code_that_exits_is_a_configuration_error(command, here):
@@ -622,7 +622,7 @@ def test_a_law_that_computes_its_own_torque_has_no_singularity(here):
     trials = montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(20))
     assert trials.counts()["singular"] == 0
     assert trials.finished.all()
-    assert "singularity_distance" not in board(ready.parts).state
+    assert "singularity_distance" not in build_board(ready.parts).state
 
 
 def test_a_run_whose_law_memory_becomes_nan_has_diverged(here):

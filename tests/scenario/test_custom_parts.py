@@ -51,7 +51,7 @@ def reported(place, by="mine.toml"):
 @pytest.fixture(autouse=True)
 def fresh(monkeypatch):
     """No custom file counts as run yet."""
-    monkeypatch.setattr(systems, "_ran", {})
+    monkeypatch.setattr(systems, "_executed_files", {})
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ def home(command, places, monkeypatch):
         )
         assert (code, error) == (0, reported(place))
         assert ran(place)
-        systems._ran.clear()
+        systems._executed_files.clear()
         shutil.copytree(place, kept)
     return place
 
@@ -152,9 +152,9 @@ def test_a_changed_custom_file_is_refused_even_with_trust(command, simulated, ho
     code, _, error = command("montecarlo", "mine.toml", "--trials", 30, "--metrics", "my.py:farthest")
     assert (code, "holds a run with system_sha256" in error) == (2, True)
     assert not ran(simulated)
-    other = campaign_folder.opened(simulated)  # as a worker on another computer does
+    other = campaign_folder.open_folder(simulated)  # as a worker on another computer does
     with pytest.raises(RefusedError, match=r"was made with another plant\.system"):
-        campaign_folder.made_again(str(simulated), other.rows.key.hex())
+        campaign_folder.rebuild_campaign(str(simulated), other.rows.key.hex())
     assert not ran(simulated)
 
 
@@ -164,7 +164,7 @@ def test_the_same_campaign_resumes_without_a_flag(command, simulated, home):
     )
     assert (code, error) == (0, reported(home))
     assert pl.read_parquet(simulated / "trials").height == 30
-    assert campaign_folder.opened(simulated).custom_metric_names == ["farthest"]
+    assert campaign_folder.open_folder(simulated).custom_metric_names == ["farthest"]
 
 
 def test_a_scenario_in_results_needs_trust_wherever_its_file_is(command, simulated, home, capsys):
@@ -292,7 +292,7 @@ def test_a_result_folder_contains_copies_of_its_custom_files(tmp_path):
         (tmp_path / name).mkdir()
         (tmp_path / name / "mine.py").write_text(text)
     where = [f"{tmp_path}/a/mine.py:Law", f"{tmp_path}/b/mine.py:Push", f"{tmp_path}/a/mine.py:Pull", "pack.age:Mine"]
-    found = custom_parts.carry(_tables(*where), made)
+    found = custom_parts.copy_custom_files(_tables(*where), made)
     assert found == _tables("mine.py:Law", "mine_2.py:Push", "mine.py:Pull", "pack.age:Mine")
     assert {path.name: path.read_text() for path in made.iterdir()} == {"mine.py": "x = 1\n", "mine_2.py": "x = 2\n"}
 
@@ -317,5 +317,5 @@ def test_a_custom_file_with_local_imports_is_not_copied(tmp_path, text, carried)
     (tmp_path / "beside.py").touch()
     (tmp_path / "mine.py").write_text(text)
     where = f"{tmp_path}/mine.py:Law"
-    assert custom_parts.carry(_tables(where), made) == _tables("mine.py:Law" if carried else where)
+    assert custom_parts.copy_custom_files(_tables(where), made) == _tables("mine.py:Law" if carried else where)
     assert [path.name for path in made.iterdir()] == (["mine.py"] if carried else [])

@@ -215,7 +215,7 @@ def test_defaults_change_with_replaced_values_and_stated_values_do_not():
     assert "observer_gain" not in free(scenario.replace(said, observer__kind="none"))
     assert scenario.replace(slow, loop__t_end=50.0, controller__t_f=30.0).loop.t_end == 50.0
     assert scenario.from_tables(parsing.dump(slow)) == slow
-    assert scenario.from_tables(parsing.stated(slow)) == slow
+    assert scenario.from_tables(parsing.stated_tables(slow)) == slow
 
 
 def test_setting_gains_in_a_scenario_changes_no_other_value():
@@ -290,17 +290,19 @@ def test_the_predicted_noise_of_the_estimate_matches_the_observer():
 def test_probe_values_beyond_a_bound_stay_in_the_allowed_range():
     """The value is a tenth of the interval beyond the bound, or None if the reason of the bound is known."""
     said = scenario.from_tables({"loop": SAMPLED, "tune": {"bounds": {"eta": [2.05, 8.0], "delta": [0.1, 10.0]}}})
-    assert free_gains.beyond(said, "eta", "upper") == pytest.approx(8.595)
-    assert free_gains.beyond(said, "eta", "lower") == pytest.approx(2.025)  # half way to 2, which is not allowed
-    assert free_gains.beyond(said, "delta", "upper") == pytest.approx(10.0 * 100.0**0.1, rel=1e-3)
-    assert free_gains.beyond(said, "delta", "lower") is None  # one period, the shortest delta
-    assert free_gains.beyond(said, "observer_gain", "upper") is None  # dead-beat
+    assert free_gains.value_beyond_bound(said, "eta", "upper") == pytest.approx(8.595)
+    assert free_gains.value_beyond_bound(said, "eta", "lower") == pytest.approx(
+        2.025
+    )  # half way to 2, the excluded end
+    assert free_gains.value_beyond_bound(said, "delta", "upper") == pytest.approx(10.0 * 100.0**0.1, rel=1e-3)
+    assert free_gains.value_beyond_bound(said, "delta", "lower") is None  # one period, the shortest delta
+    assert free_gains.value_beyond_bound(said, "observer_gain", "upper") is None  # dead-beat
     law, observer = {"kind": "scaling", "disturbance_rate_bound": 0.123456}, {"kind": "finite_time"}
     other = scenario.from_tables({"controller": law, "observer": observer, "loop": SAMPLED, "tune": {}})
     assert other.search.bounds["m"][0] == 1.0
     assert other.search.bounds["observer_gain"][0] == 0.123456
     for gain in ("m", "observer_gain"):  # the bound is the smallest allowed value
-        assert free_gains.beyond(other, gain, "lower") is None
+        assert free_gains.value_beyond_bound(other, gain, "lower") is None
 
 
 class Vibration(Disturbance):

@@ -44,7 +44,7 @@ def test_defaults_of_a_chain_scale_with_t_f(order):
 )
 def test_published_cases_keep_the_published_numbers(changes, published):
     law = scenario.from_tables({**SAMPLED, **changes}).controller
-    assert mission.published(scenario.from_tables(changes)) == published
+    assert mission.is_published_case(scenario.from_tables(changes)) == published
     found = (law.eta, law.delta, law.k1, law.surface_rate, law.sign_width)
     assert (found == (3.0, 0.05, 1.0, 1.0, 1e-3)) == published
 
@@ -104,7 +104,7 @@ def test_the_designed_loop_has_the_documented_stability_margins():
     L = (1 + r / s) (2 p s + p^2) e^(-sT) / s^2 + r e^(-sT) / s, since the estimate is r / s times the unexplained
     torque.
     """
-    p, r = mission.STABLE, mission.OBSERVER * mission.STABLE
+    p, r = mission.MAX_POLE_TIMES_DEAD_TIME, mission.OBSERVER_TO_POLE * mission.MAX_POLE_TIMES_DEAD_TIME
     w = np.geomspace(1e-3, 30.0, 200_001)
     s = 1j * w
     L = ((1 + r / s) * (2 * p * s + p**2) / s**2 + r / s) * np.exp(-s)
@@ -146,7 +146,7 @@ def test_a_weak_actuator_reduces_eta():
 def test_designs_are_starting_points_within_the_bounds_or_near():
     """Each design has all gains of the law, with delta between a control period and t_f."""
     said = scenario.replace(sampled(), tune={})
-    designs = mission.designs(said)
+    designs = mission.starting_designs(said)
     assert len(designs) > 5
     for design in designs:
         gains = said.controller.gains_of(design, said)

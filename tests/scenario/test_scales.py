@@ -114,7 +114,7 @@ def test_the_noise_of_s_of_a_chain_has_the_weights_of_the_surface():
 def test_noise_hides_a_boundary_layer_below_the_smallest_useful_width():
     """The mean derivative of tanh((s + n) / width) at s = 0 is E[sech^2(n / width)] / width, here by quadrature."""
     noise = 3e-6
-    width = scales.narrowest_that_matters(noise)
+    width = scales.narrowest_useful_width(noise)
     z = np.linspace(-30.0, 30.0, 20001)  # n in units of the width
     density = np.exp(-0.5 * (z * width / noise) ** 2) / math.sqrt(2 * math.pi) / noise
     slope = np.trapezoid(density / np.cosh(z) ** 2, z)
@@ -124,11 +124,13 @@ def test_noise_hides_a_boundary_layer_below_the_smallest_useful_width():
 
 def test_useful_boundary_layers_scale_with_the_noise():
     noise = 0.5 * math.hypot(1e-6, 2e-5)
-    low, high = scales.widths(flight())
+    low, high = scales.width_range(flight())
     np.testing.assert_allclose([low, high], [math.sqrt(1.2) / math.pi * noise, 1e4 * noise])
-    assert scales.widths(flight(hardware__attitude_noise=0.0, hardware__rate_noise=0.0)) == pytest.approx((1e-5, 1e-1))
+    assert scales.width_range(flight(hardware__attitude_noise=0.0, hardware__rate_noise=0.0)) == pytest.approx(
+        (1e-5, 1e-1)
+    )
     slow = scenario.from_tables({"controller": {"t_f": 120.0}, "loop": {"mode": "sampled"}})
-    assert scales.widths(slow) == pytest.approx((2.5e-6, 2.5e-2))  # four times the published t_f: a quarter of s
+    assert scales.width_range(slow) == pytest.approx((2.5e-6, 2.5e-2))  # four times the published t_f: a quarter of s
     arm = {**ARM, "loop": {"mode": "sampled"}, "hardware": {"state_noise": [3e-4, 4e-4]},
            "controller": {"surface_rate": 2.0}}  # fmt: skip
     np.testing.assert_allclose(noise_of_s(scenario.from_tables(arm)), math.hypot(6e-4, 4e-4))

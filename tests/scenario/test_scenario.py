@@ -381,7 +381,7 @@ def test_steps_are_bounded_for_the_longest_run_of_a_search():
     loop = {"mode": "sampled", "period": 0.5, "t_end": 60_010.0, "window": 1.0}
     scenario = from_tables({"loop": loop, "controller": {"t_f": 6e4, "delta": 1.0}})
     reach = reach_of(scenario, t_f=12e4)
-    assert 120_020 <= timing.steps(study(scenario).parts) <= 120_025  # (6e4 + 10) / 0.5, and some at the ends
+    assert 120_020 <= timing.count_steps(study(scenario).parts) <= 120_025  # (6e4 + 10) / 0.5, and some at the ends
     with pytest.raises(ScenarioError) as caught:
         study(scenario, reach=reach)
     check_sentence(str(caught.value), "tune.bounds.t_f asks for runs of 120010 s", "take 240020 steps, 1 a period")
@@ -529,7 +529,7 @@ def test_written_files_have_every_default_and_give_the_same_run(text, table, key
     said = from_tables(tomllib.loads(text))
     written = parsing.dump(said)
     assert set(keys) <= written[table].keys()
-    assert not set(keys) & parsing.stated(said)[table].keys()
+    assert not set(keys) & parsing.stated_tables(said)[table].keys()
     again = from_tables(written)
     assert parsing.dump(again) == written
     ours, theirs = (jax.tree.leaves(study(one).parts) for one in (said, again))

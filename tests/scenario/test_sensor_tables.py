@@ -42,7 +42,7 @@ def test_the_built_sensors_have_the_numbers_of_the_tables():
     turned = Rotation.from_rotvec([10.0, 20.0, 30.0], degrees=True)
     np.testing.assert_allclose(second.axes(), turned.as_matrix().T, atol=1e-15)
     assert (float(first.times.interval), float(first.times.latency)) == (0.25, 0.12)
-    assert (second.times.every, second.times.wait, sun.times.past) == (1, 0, 0)
+    assert (second.times.every, second.times.wait, sun.times.past_samples) == (1, 0, 0)
     np.testing.assert_allclose(suite.rate_noise, [1e-6] * 3, rtol=1e-15)
     np.testing.assert_allclose(suite.bias_rate, [1e-8 / np.sqrt(0.1)] * 3, rtol=1e-15)
     for known, true in zip(suite.filter.sensors, suite.sensors, strict=True):
@@ -58,9 +58,9 @@ def test_every_boresight_has_a_mounting(boresight):
 
 def test_several_gyros_are_averaged_with_information_weights():
     """Two equal gyros reduce every error by sqrt(2). A second gyro with far more noise changes little."""
-    both = read(TRACKER, GYRO, GYRO).sensors.gyro(0.1)
+    both = read(TRACKER, GYRO, GYRO).sensors.mean_gyro(0.1)
     np.testing.assert_allclose(both, np.array([1e-6, 1e-5, 1e-8]) / np.sqrt(2.0), rtol=1e-14)
-    one = read(TRACKER, GYRO, {**GYRO, "rate_noise": 1e-3, "rate_bias": 1e-4}).sensors.gyro(0.1)
+    one = read(TRACKER, GYRO, {**GYRO, "rate_noise": 1e-3, "rate_bias": 1e-4}).sensors.mean_gyro(0.1)
     np.testing.assert_allclose(one, [1e-6, 1e-5, 1e-8], rtol=1e-5)
 
 

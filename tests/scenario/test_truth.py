@@ -83,12 +83,14 @@ def test_a_true_plant_with_a_hidden_state_matches_the_matrix_exponential():
     told = run.columns()
     np.testing.assert_array_equal(told["z1"], x[:, 2])
     assert [name for name in told if name[0] == "x"] == ["x1", "x2"]
-    course = linear.nominal_jit(parts)
+    course = linear.simulate_nominal_jit(parts)
     last = np.flatnonzero(linear.is_full(jax.tree.map(np.asarray, course.period.now), PERIOD))[-1:]
-    loop = jax.tree.map(lambda v: np.asarray(v)[0], linear.loops_in(parts, course, last))  # with z
-    poles = np.abs(np.linalg.eigvals(linear.at_input(loop, 0.0, np).closed()))
+    loop = jax.tree.map(lambda v: np.asarray(v)[0], linear.open_loops(parts, course, last))  # with z
+    poles = np.abs(np.linalg.eigvals(linear.open_at_input(loop, 0.0, np).closed()))
     closed = block[:3, :3] + np.outer(block[:3, 3], [-2.0, -1.5, 0.0])
-    slowest = poles[np.abs(poles - 1.0) > margins.NEUTRAL].max()  # without an observer, the memory has a pole at 1
+    slowest = poles[
+        np.abs(poles - 1.0) > margins.CIRCLE_TOLERANCE
+    ].max()  # without an observer, the memory has a pole at 1
     np.testing.assert_allclose(slowest, np.abs(np.linalg.eigvals(closed)).max(), rtol=1e-5)
 
 
@@ -114,8 +116,8 @@ def test_exact_motion_names_and_exported_code_ignore_hidden_states():
         planned, expected = (solutions.exact_input(one, jnp.asarray(t))[0] for one in (parts, known))
         np.testing.assert_allclose(planned, expected, rtol=1e-12)
     ready = scenario.study(scenario.from_tables({**HIDDEN, "controller": law}))
-    assert stability.names(ready)[1] == ["x1", "x2"]
-    assert board.board(parts).inputs["x"].shape == (2,)
+    assert stability.signal_names(ready)[1] == ["x1", "x2"]
+    assert board.build_board(parts).inputs["x"].shape == (2,)
 
 
 @pytest.mark.parametrize(
@@ -144,7 +146,7 @@ def test_comparison_laws_control_a_custom_system(kind):
 
 def test_a_custom_true_plant_is_reported_as_custom_code():
     loaded = scenario.from_tables(TABLES)
-    assert set(custom.programs(loaded)) == {"plant.system", "plant.truth"}
+    assert set(custom.code_by_key(loaded)) == {"plant.system", "plant.truth"}
     assert set(custom.checksums(loaded)) == {"system_sha256", "truth_sha256"}
 
 

@@ -31,34 +31,34 @@ def test_probability_of_a_met_verdict_agrees_with_bayes_rule_on_a_grid(requireme
     most = 1000 - least
     expected = np.sum(weight * binom.cdf(most, 1000, fraction)) / np.sum(weight)
     # the fraction is known to 2e-4, so the midpoint rule with a step of 5e-5 has a relative error of about 1e-3
-    np.testing.assert_allclose(confirm.probability(requirement, 1000, 4096, beyond), expected, rtol=2e-3)
+    np.testing.assert_allclose(confirm.verdict_probability(requirement, 1000, 4096, beyond), expected, rtol=2e-3)
 
 
 @pytest.mark.parametrize("requirement", [SHOWN, SEEN, replace(SHOWN, quantile=0.9973, confidence=0.9)])
 def test_allowed_is_the_largest_count_with_a_sure_verdict(requirement):
     held_out = confirm.held_out_trials([requirement])
-    trials = max(confirm.FEWEST, confirm.TIMES * held_out)
-    most = confirm.allowed(requirement, held_out, trials)
+    trials = max(confirm.FEWEST_TRIALS, confirm.FEWEST_RATIO * held_out)
+    most = confirm.allowed_violations(requirement, held_out, trials)
     assert most is not None
-    assert confirm.probability(requirement, held_out, trials, most) >= confirm.SURE
-    assert confirm.probability(requirement, held_out, trials, most + 1) < confirm.SURE
+    assert confirm.verdict_probability(requirement, held_out, trials, most) >= confirm.CONFIDENT
+    assert confirm.verdict_probability(requirement, held_out, trials, most + 1) < confirm.CONFIDENT
     assert most < (1.0 - requirement.quantile) * trials  # fewer than the fraction itself, because the verdict is random
 
 
 def test_a_quantile_limit_applies_to_the_training_trials_or_to_a_band():
     """A quantile of 99 % with 95 % confidence allows no violation in 299 trials, so a search needs more trials."""
     every = Requirement("peak_torque", 0.5)
-    assert confirm.may_break(every, [every], 64) == (None, False)
-    assert confirm.may_break(SEEN, [SEEN], 64) == (6, False)  # ceil(0.9 * 64) = 58 trials must keep it
+    assert confirm.allowed_in_training(every, [every], 64) == (None, False)
+    assert confirm.allowed_in_training(SEEN, [SEEN], 64) == (6, False)  # ceil(0.9 * 64) = 58 trials must keep it
     kept = must_keep(598, 0.99, 0.95)
     assert kept is not None
-    assert confirm.may_break(SHOWN, [SHOWN], 598) == (598 - kept, False)
-    most = confirm.allowed(SHOWN, 1000, 8000)
-    assert confirm.may_break(SHOWN, [SHOWN], 597) == (most, True)
+    assert confirm.allowed_in_training(SHOWN, [SHOWN], 598) == (598 - kept, False)
+    most = confirm.allowed_violations(SHOWN, 1000, 8000)
+    assert confirm.allowed_in_training(SHOWN, [SHOWN], 597) == (most, True)
     assert most is not None
-    assert 0 < most < confirm.FARTHER
+    assert 0 < most < confirm.BAND_MAY_BREAK
     loose = replace(SHOWN, quantile=0.9)
-    assert confirm.may_break(loose, [loose], 8) == (confirm.FARTHER, True)  # of 8000 trials
+    assert confirm.allowed_in_training(loose, [loose], 8) == (confirm.BAND_MAY_BREAK, True)  # of 8000 trials
 
 
 def test_a_band_contains_the_trials_ranked_around_the_last_that_may_break_the_limit(monkeypatch):
@@ -73,13 +73,13 @@ def test_a_band_contains_the_trials_ranked_around_the_last_that_may_break_the_li
 
     monkeypatch.setattr(confirm.simulations, "simulate_trials", fly)
     some: Any = SimpleNamespace(batch_of=lambda numbers: numbers)
-    (found,) = confirm.count(some, [loose], np.zeros(2), 100, 2)
+    (found,) = confirm.count_violations(some, [loose], np.zeros(2), 100, 2)
     assert found.allowed is not None
     first = 100 + 2 * count
     order = [first + 5, *range(first + count - 1, first + count // 2, -1)]
     assert found.violations == count
-    assert found.band.tolist() == order[found.allowed - confirm.FARTHER : found.allowed + confirm.NEARER]
-    assert found.harder[:8].tolist() == order[found.allowed : found.allowed + 8]
+    assert found.band.tolist() == order[found.allowed - confirm.BAND_MAY_BREAK : found.allowed + confirm.BAND_MUST_KEEP]
+    assert found.surplus_violators[:8].tolist() == order[found.allowed : found.allowed + 8]
 
 
 def test_a_band_replaces_the_training_trials_in_a_quantile_limit():
@@ -114,21 +114,21 @@ def test_confirmation_uses_trials_that_the_search_has_not_simulated(monkeypatch)
     many = confirm.confirmation_trials(wanted)
 
     def count(posed, asked, gains, first, turn):
-        seen.append(range(first + turn * many, first + (turn + 1) * many))  # as in `confirm.count`
+        seen.append(range(first + turn * many, first + (turn + 1) * many))  # as in `confirm.count_violations`
         return [SimpleNamespace(trials=many)]
 
     def trials(numbers, gains):
         seen.append(range(int(numbers[0]), int(numbers[-1]) + 1))
         return SimpleNamespace(finished=np.ones(numbers.size, bool), metrics=SimpleNamespace(peak_torque=0.0 * numbers))
 
-    monkeypatch.setattr(rounds.confirm, "count", count)
+    monkeypatch.setattr(rounds.confirm, "count_violations", count)
     monkeypatch.setattr(rounds.worst_case.simulations, "simulate_trials", trials)
     evaluate = Evaluator(limits)
     search = rounds.Rounds(evaluate, posed, wanted, robust=False)
     told: Any = SimpleNamespace(averaged=search.problem.averaged, batch_of=lambda numbers: numbers)
     rounds.worst_case.screen(told, wanted, at)
     for _ in range(2):
-        search._count(at)
+        search._count_violations(at)
     seen.append(range(search.problem.averaged))
     ordered = sorted(seen, key=lambda one: one.start)
     assert all(one.stop <= other.start for one, other in itertools.pairwise(ordered))
@@ -136,7 +136,7 @@ def test_confirmation_uses_trials_that_the_search_has_not_simulated(monkeypatch)
 
 
 def test_too_few_trials_cannot_confirm_a_requirement():
-    assert confirm.allowed(SHOWN, 1000, 20) is None
+    assert confirm.allowed_violations(SHOWN, 1000, 20) is None
 
 
 @pytest.mark.long
@@ -151,7 +151,7 @@ def test_gains_keep_a_quantile_limit_on_held_out_trials(monkeypatch, quantile, c
     limit, seed = 0.7, 2  # with this seed, the first eight trials are easy
     wanted = [Requirement("peak_torque", limit, None, quantile, confidence)]
     parts = problem(peak_torque=limit).parts
-    allowed, banded = confirm.may_break(wanted[0], wanted, 8)
+    allowed, banded = confirm.allowed_in_training(wanted[0], wanted, 8)
     some = objective.problem(
         parts, SPREAD, seed, np.arange(8), limits.names, wanted, may_break=(allowed,), banded=(banded,)
     )

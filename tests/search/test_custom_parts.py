@@ -19,10 +19,10 @@ def test_folder_of_results_is_found_at_any_depth(tmp_path, place, inside):
     path = results / place
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("")
-    assert custom_parts.results_of(path) == (results if inside else None)
+    assert custom_parts.find_results_folder(path) == (results if inside else None)
     link = tmp_path / "link.toml"
     link.symlink_to(path)
-    assert custom_parts.results_of(link) == (results if inside else None)  # the link is resolved
+    assert custom_parts.find_results_folder(link) == (results if inside else None)  # the link is resolved
 
 
 def test_a_symbolic_link_in_results_to_an_outside_file_belongs_to_the_results(tmp_path):
@@ -32,8 +32,8 @@ def test_a_symbolic_link_in_results_to_an_outside_file_belongs_to_the_results(tm
     (results / "versions.json").write_text("{}")
     mine.write_text("")
     (results / "tuned.toml").symlink_to(mine)
-    assert custom_parts.results_of(results / "tuned.toml") == results
-    assert custom_parts.results_of(mine) is None
+    assert custom_parts.find_results_folder(results / "tuned.toml") == results
+    assert custom_parts.find_results_folder(mine) is None
 
 
 def test_a_file_named_by_several_keys_is_reported_once(tmp_path, capsys):
@@ -43,9 +43,9 @@ def test_a_file_named_by_several_keys_is_reported_once(tmp_path, capsys):
     with pytest.raises(
         RefusedError, match=rf"custom code, {law} \(controller.code, observer.code, reference.code\), which"
     ):
-        custom_parts.allow(programs, tmp_path, {}, trusted=False)
+        custom_parts.allow_results(programs, tmp_path, {}, trusted=False)
     checksums = {custom.checksum_name(key): systems.checksum(where) for key, where in programs.items()}
-    custom_parts.allow(programs, tmp_path, checksums, trusted=True)
+    custom_parts.allow_results(programs, tmp_path, checksums, trusted=True)
     keys = "controller.code, observer.code and reference.code"
     assert capsys.readouterr().err == f"ptsmc: runs {law}, which {keys} of {tmp_path} name\n"
 
@@ -57,7 +57,7 @@ def test_a_program_without_a_checksum_in_the_results_is_reported(tmp_path, capsy
     programs = {"controller.code": f"{law}:Mine", "observer.code": f"{other}:Mine"}
     made = {"controller_sha256": systems.checksum(f"{law}:Mine")}
     assert custom_parts.check_unchanged(programs, tmp_path, made) == ["observer.code"]
-    custom_parts.allow(programs, tmp_path, made, trusted=True)
+    custom_parts.allow_results(programs, tmp_path, made, trusted=True)
     (said,) = [line for line in capsys.readouterr().err.splitlines() if "no checksum" in line]
     assert str(other) in said
     assert str(law) not in said

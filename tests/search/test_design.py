@@ -133,7 +133,7 @@ def test_a_quantile_limit_is_kept_by_that_fraction_of_the_trials(confidence, lea
     assert found.theory is not None
     for factor, shown in ((1.0, True), (0.995, False)):
         drawn = ready.dispersion, np.uint32(4), trials.astype(np.uint32)
-        assert (np.sum(design._predicted(ready.parts, *drawn, factor * found.theory) <= 2.0) >= least) == shown
+        assert (np.sum(design._predict_peaks(ready.parts, *drawn, factor * found.theory) <= 2.0) >= least) == shown
         parts = with_gains(ready.parts, {"t_f": factor * found.simulated})
         peaks = montecarlo.run(parts, ready.dispersion, 4, trials).metrics.peak_torque
         assert asked.verdict(peaks, np.ones(8, bool)).met == shown
@@ -144,13 +144,13 @@ def test_a_quantile_limit_is_kept_by_that_fraction_of_the_trials(confidence, lea
 
 @pytest.mark.parametrize("power", [1.0, 2.0, 3.0])
 def test_search_finds_the_last_crossing(power):
-    found = design._smallest(lambda t: t**-power + 0.02 * np.sin(t), 0.1, 3.0, 1e-3, 1e3, 1e-4, 60)
+    found = design._shortest_t_f(lambda t: t**-power + 0.02 * np.sin(t), 0.1, 3.0, 1e-3, 1e3, 1e-4, 60)
     assert found is not None
     assert found**-power + 0.02 * np.sin(found) <= 0.1
     before = found * (1 - 2e-4)
     assert before**-power + 0.02 * np.sin(before) > 0.1
-    assert design._smallest(lambda t: 1.0 + 1 / t, 0.5, 1.0, 1e-3, 10.0, 1e-4, 60) is None
-    assert design._smallest(lambda t: np.inf if t < 2.0 else 0.0, 0.5, 1.0, 0.1, 10.0, 1e-3, 60) == pytest.approx(
+    assert design._shortest_t_f(lambda t: 1.0 + 1 / t, 0.5, 1.0, 1e-3, 10.0, 1e-4, 60) is None
+    assert design._shortest_t_f(lambda t: np.inf if t < 2.0 else 0.0, 0.5, 1.0, 0.1, 10.0, 1e-3, 60) == pytest.approx(
         2.0, rel=2e-3
     )
 
@@ -158,7 +158,7 @@ def test_search_finds_the_last_crossing(power):
 def test_the_bracket_is_halved_if_peaks_hardly_decrease_with_t_f():
     """Steps after the rule 1 / t^2 are tiny in this case, from both sides."""
     for start in (60.0, 10.0):
-        found = design._smallest(lambda t: 1.0 + 1e-6 * (30.0 - t), 1.0, start, 1.0, 100.0, 1e-3, 60)
+        found = design._shortest_t_f(lambda t: 1.0 + 1e-6 * (30.0 - t), 1.0, start, 1.0, 100.0, 1e-3, 60)
         assert found == pytest.approx(30.0, rel=1e-3)
 
 

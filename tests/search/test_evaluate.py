@@ -12,7 +12,7 @@ import ptsmc_jax as ptsmc
 from ptsmc_jax import scenario
 from ptsmc_jax.simulation import rollout
 from tuning.search import evaluate
-from tuning.search.evaluate import Evaluator, Measured, MeasuredWithGradients
+from tuning.search.evaluate import Evaluator, Measurement, MeasurementWithGradients
 from tuning.search.local_search import Best
 from tuning.search.local_searches import LocalSearches
 from tuning.search.normalisation import Bounds
@@ -29,12 +29,12 @@ def test_rows_of_trials_and_of_margins_are_padded_without_changing_the_result(mo
     simulated = {"c": rng.uniform(-0.9, -0.5, (2, 2, trials)), "c_gradient": rng.normal(size=(2, 2, trials, 2))}
     of_loop = {"c": rng.uniform(-0.9, -0.5, (2, 1, loops)), "c_gradient": rng.normal(size=(2, 1, loops, 2))}
     normalised = np.array([[0.0, 0.0], [1.0, 1.0]])
-    monkeypatch.setattr(evaluate.margin_rows, "of_points", lambda margins, bounds, normalised: of_loop)
+    monkeypatch.setattr(evaluate.margin_rows, "constraints_at_points", lambda margins, bounds, normalised: of_loop)
     some: Any = SimpleNamespace(margins=object(), objective="window_error")
     evaluator = Evaluator(Bounds(("eta", "delta"), (2.0, 0.1), (3.0, 1.0)))
     rest = {"gains": normalised, "f": np.zeros(2), "value": np.zeros(2), "f_gradient": np.zeros((2, 2))}
-    found = MeasuredWithGradients(
-        **evaluator._measured(lambda problem, normalised: {**rest, **simulated}, some, normalised)
+    found = MeasurementWithGradients(
+        **evaluator._evaluate(lambda problem, normalised: {**rest, **simulated}, some, normalised)
     )
     assert found.c.shape == (2, 3, 5)
     for name, filled in (("c", -1.0), ("c_gradient", 0.0)):
@@ -105,13 +105,13 @@ def test_goal_limits_includes_the_margins(monkeypatch):
     """F and its gradient follow the largest row: a metric's at the first point, a margin's at the second point."""
     simulated = {"c": np.array([[[0.3, -0.2]], [[-0.5, -0.4]]]), "c_gradient": np.arange(8.0).reshape(2, 1, 2, 2)}
     of_loop = {"c": np.array([[[-0.1]], [[0.6]]]), "c_gradient": 10.0 + np.arange(4.0).reshape(2, 1, 1, 2)}
-    monkeypatch.setattr(evaluate.margin_rows, "of_points", lambda margins, scale, normalised: of_loop)
+    monkeypatch.setattr(evaluate.margin_rows, "constraints_at_points", lambda margins, scale, normalised: of_loop)
     some: Any = SimpleNamespace(margins=object(), objective="limits")
     evaluator = Evaluator(Bounds(("eta", "delta"), (2.0, 0.1), (3.0, 1.0)))
     normalised = np.zeros((2, 2))
     rest = {"gains": normalised, "f": np.zeros(2), "value": np.zeros(2), "f_gradient": np.zeros((2, 2))}
-    found = MeasuredWithGradients(
-        **evaluator._measured(lambda problem, normalised: {**rest, **simulated}, some, normalised)
+    found = MeasurementWithGradients(
+        **evaluator._evaluate(lambda problem, normalised: {**rest, **simulated}, some, normalised)
     )
     np.testing.assert_allclose(np.exp(found.f), [1.3, 1.6], rtol=1e-12)
     np.testing.assert_array_equal(found.value, found.f)
@@ -125,7 +125,7 @@ def test_the_objective_is_nan_if_no_trial_completes():
     status = jnp.asarray([[rollout.OK, rollout.DIVERGED], [rollout.DIVERGED] * 2], jnp.int32)
     judged = [judge(rules, jnp.asarray([3.0]), jnp.asarray([[4.0, 0.3, 0.3], [5.0, 0.2, 0.2]]), one) for one in status]
     f, c, value = map(np.asarray, zip(*judged, strict=True))
-    seen = Measured(gains=np.array([[3.0], [3.0]]), f=f, c=c, value=value)
+    seen = Measurement(gains=np.array([[3.0], [3.0]]), f=f, c=c, value=value)
     np.testing.assert_allclose(seen.objective, [4.0, np.nan], rtol=1e-12)
     run = LocalSearches(Evaluator(Bounds(("eta",), (2.0,), (4.0,))), 0.0, 2, np.random.default_rng(0))
     best = Best(np.array([0.5]), 1, 0.0)
@@ -148,7 +148,7 @@ def test_a_custom_system_has_the_same_journal_questions_in_another_process():
         tables = {"plant": {"kind": "system", "system": pendulum, "x0": [1.0, 0.0]}, "loop": {"mode": "sampled"}}
         ready = scenario.study(scenario.from_tables(tables))
         posed = problem(ready.parts, ready.dispersion, 0, np.arange(2), ("eta",))
-        return pendulum, evaluate._request(b"values", posed, np.zeros((1, 1)))
+        return pendulum, evaluate._encode_request(b"values", posed, np.zeros((1, 1)))
 
     (one, asked), (other, again) = question(), question()
     assert one != other

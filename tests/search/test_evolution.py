@@ -7,7 +7,7 @@ from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import parts
 from tests.search.test_tuning import TURNED
 from tuning.search import evolution, objective
-from tuning.search.evaluate import Evaluator, Measured
+from tuning.search.evaluate import Evaluator, Measurement
 from tuning.search.local_search import Best
 from tuning.search.local_searches import LocalSearches
 from tuning.search.normalisation import Bounds
@@ -31,10 +31,10 @@ class Valley(Evaluator):
         f = np.where(x[:, 0] > self.wall, np.nan, np.einsum("pi,ij,pj->p", x, self.matrix, x))
         violation = np.zeros(len(normalised)) - 1.0 if self.along is None else self.least - x @ self.along
         violation = np.where(x[:, 0] < self.lost, objective.FAILED - 1.0, violation)
-        return Measured(normalised, f, violation[:, None, None], f)
+        return Measurement(normalised, f, violation[:, None, None], f)
 
 
-def refined(valley, start, seed=3, size=evolution.WIDELY):
+def refined(valley, start, seed=3, size=evolution.WHOLE_BOX):
     names = valley.bounds.names
     some = objective.problem(parts(20.0, 3.0, 1.0), TURNED, 0, np.arange(1), names, [Requirement("peak_torque", 1.0)])
     normalised = 0.5 + np.asarray(start)
@@ -55,8 +55,8 @@ def narrow(count):
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_minimum_of_an_ill_conditioned_rotated_quadratic_with_a_wall_is_found(seed):
     best, told = refined(Valley(narrow(3), wall=0.2), [-0.35, 0.3, -0.3], seed)
-    # the search ends if `PATIENCE` generations reduce F by less than GAINED, so a few times GAINED can remain
-    assert best.f < 5.0 * evolution.GAINED
+    # the search ends if `PATIENCE` generations reduce F by less than `LEAST_DECREASE`, so a few times that can remain
+    assert best.f < 5.0 * evolution.LEAST_DECREASE
     assert np.isfinite(best.f)
     assert [done for done, _ in told] == list(range(len(told)))
 
@@ -69,7 +69,7 @@ def test_constrained_optimum_on_an_active_limit_is_found(seed):
     best, _ = refined(Valley(matrix, along, least), [0.35, 0.3, -0.3], seed)
     assert best.violation == 0.0
     assert optimum - 2.0 * (2.0 * least / inverse) * 1e-4 <= best.f  # points may exceed the limit by SLACK
-    assert best.f <= optimum + 5.0 * evolution.GAINED
+    assert best.f <= optimum + 5.0 * evolution.LEAST_DECREASE
 
 
 def test_the_first_point_of_the_history_is_the_best_of_the_sweep():
@@ -79,7 +79,7 @@ def test_the_first_point_of_the_history_is_the_best_of_the_sweep():
     valley.bounds = Bounds(names, (1.0, 1.0), (2.0, 2.0))
     some = objective.problem(parts(20.0, 3.0, 1.0), TURNED, 0, np.arange(1), names, [Requirement("peak_torque", 1.0)])
     search = LocalSearches(valley, 0.0, 4, np.random.default_rng(0))
-    search.sweep(some, np.full(2, 1.9))
+    search.measure_sobol_points(some, np.full(2, 1.9))
     (first,) = search.history
     assert first.value == search.best.value
     assert search.best.f < 0.01  # of 512 points spread over the square
@@ -90,7 +90,7 @@ def test_gains_with_a_failed_trial_are_not_accepted(seed):
     """F decreases towards points with a failed trial that does not count in F."""
     best, _ = refined(Valley(np.eye(2), lost=0.2), [0.4, 0.1], seed)
     assert not best.failed
-    assert 0.2**2 <= best.f <= 0.2**2 + 5.0 * evolution.GAINED
+    assert 0.2**2 <= best.f <= 0.2**2 + 5.0 * evolution.LEAST_DECREASE
 
 
 def test_a_single_gain_is_optimised():
@@ -103,14 +103,14 @@ def test_search_ends_early_without_progress():
     assert len(told) <= evolution.PATIENCE + 1
 
 
-@pytest.mark.parametrize("size", [evolution.NEARBY, evolution.WIDELY])
+@pytest.mark.parametrize("size", [evolution.NEAR_BEST, evolution.WHOLE_BOX])
 def test_first_generation_is_around_the_starting_point_or_in_the_whole_box(size):
     valley = Valley(np.eye(2))
     refined(valley, [0.1, -0.2], size=size)
     first = valley.seen[1]  # after the starting point itself
     assert first.shape == (size[0], 2)
     np.testing.assert_allclose(first[0], [0.1, -0.2])
-    if size is evolution.NEARBY:
+    if size is evolution.NEAR_BEST:
         np.testing.assert_allclose(first.mean(axis=0), [0.1, -0.2], atol=5.0 * size[1] / np.sqrt(len(first)))
         assert np.all(np.abs(first.std(axis=0) / size[1] - 1.0) < 0.3)
     else:
@@ -132,5 +132,5 @@ def test_the_starting_point_remains_if_all_points_fail():
 def test_a_feasible_point_is_better_than_an_infeasible_one_with_a_smaller_objective():
     normalised, f, violation = np.asarray([[0.2], [0.7]]), np.asarray([1.0, 2.0]), np.asarray([0.5, -0.1])
     best = Best(np.zeros(1), 1, 0.0)
-    best.offer(normalised, Measured(normalised, f, violation[:, None, None], f))
+    best.offer(normalised, Measurement(normalised, f, violation[:, None, None], f))
     assert (best.normalised[0], best.f, best.violation) == (0.7, 2.0, 0.0)

@@ -14,7 +14,7 @@ from ptsmc_jax.laws import prescribed_time
 from ptsmc_jax.numerics.pytrees import pytree
 from ptsmc_jax.scenario import free_gains, from_tables, gain_bounds, study, timing
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.scenario.gain_bounds import Choice
+from ptsmc_jax.scenario.gain_bounds import BoundsContext
 from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.scenario.observer_tables import OBSERVERS
 from ptsmc_jax.simulation import rollout
@@ -59,7 +59,7 @@ OTHERS = {
 def wide(tables=None):
     """Return the scenario and its parts, with a clock that has samples for all gains within their bounds."""
     scenario = from_tables({**BASE, "tune": TUNED, **(tables or {})})
-    return scenario, posing.tuning_problem(scenario, 0).ready
+    return scenario, posing.set_up_tuning(scenario, 0).ready
 
 
 @pytest.mark.parametrize("name", OTHERS)
@@ -105,10 +105,10 @@ def test_an_invalid_gain_is_named_in_the_error_also_if_t_f_is_set_too(name, key)
 def test_gains_of_single_axes_have_names_and_bounds():
     tables = {"free": ["eta", "observer_gain"], "per_axis": True, "bounds": {"observer_gain": [1.0, 50.0]}}
     scenario, ready = wide({"tune": tables, "observer": {"gain": [3.0, 4.0, 5.0]}})
-    names = gains.named(scenario)
+    names = gains.free_gain_names(scenario)
     assert names == ("eta", "observer_gain_1", "observer_gain_2", "observer_gain_3")
     assert gains.present_values(ready.parts, names) == [3.0, 3.0, 4.0, 5.0]
-    some = normalisation.of_scenario(scenario, ready.parts)
+    some = normalisation.bounds_of_scenario(scenario, ready.parts)
     assert some.names == names
     assert (some.lower[1:], some.upper[1:]) == ((1.0,) * 3, (50.0,) * 3)
     assert gains.gains_of(ready.parts)["observer_gain"] == 4.0
@@ -187,7 +187,7 @@ def test_gains_of_a_chain_and_its_observer_are_set_in_parts(kind):
         "tune": {"free": ["t_f", "eta", "observer_gain"]},
     }
     scenario = from_tables(tables)
-    ready = posing.tuning_problem(scenario, 0).ready
+    ready = posing.set_up_tuning(scenario, 0).ready
     wanted = {"t_f": 9.0, "eta": 3.4, "observer_gain": gains.gains_of(ready.parts)["observer_gain"] * 1.5}
     moved = gains.with_gains(ready.parts, wanted)
     changed = study(gains.in_scenario(scenario, wanted))
@@ -258,7 +258,7 @@ def test_default_bounds_of_surface_rate_begin_at_1_75_over_t_f_and_end_at_half_o
     if period is not None:  # the stability limit itself, without K1 and the switching term
         for c, stable in ((1.999 / period, True), (2.001 / period, False)):
             kp, kd = stability_limits.gains(np.asarray(t_f), t_f, 3.0, 0.5, 0.0, 0.0, c)
-            assert (stability_limits.radius(float(kp) + 1e-9, float(kd), period) < 1.0) == stable
+            assert (stability_limits.spectral_radius(float(kp) + 1e-9, float(kd), period) < 1.0) == stable
 
 
 @pytest.mark.parametrize(
@@ -317,15 +317,15 @@ def test_default_bounds_are_widened_on_the_side_where_a_gain_ended():
     sides = dict.fromkeys(free, "upper")
     for mode, moved in (("continuous", ["eta", "observer_gain", "k1"]), ("sampled", ["eta"])):
         made = from_tables({"controller": {"t_f": 30.0}, "loop": {"mode": mode}, "tune": tune})
-        found, bounds = free_gains.widened(made, sides, made.defaulted), made.search.bounds
+        found, bounds = free_gains.widen_bounds(made, sides, made.defaulted), made.search.bounds
         assert list(found) == moved
         for name, (low, high) in found.items():
             least, most = bounds[name]
             farther = most + 0.5 * (most - least) if name == "eta" else 10.0 * most
             assert (low, high) == (least, pytest.approx(farther, rel=1e-12))
-    found = free_gains.widened(made, {"eta": "lower"}, made.defaulted)
+    found = free_gains.widen_bounds(made, {"eta": "lower"}, made.defaulted)
     assert found["eta"] == (pytest.approx(0.5 * (2.0 + bounds["eta"][0])), bounds["eta"][1])  # eta exceeds 2
-    assert free_gains.widened(made, sides, set()) == {}
+    assert free_gains.widen_bounds(made, sides, set()) == {}
 
 
 @pytest.mark.parametrize(
@@ -354,7 +354,7 @@ def test_gains_are_compared_with_the_published_ones_only_if_these_can_be_simulat
     fast = {"initial": {"rotvec_deg": [0.0, 0.0, 0.0], "rate": [0.6, 0.0, 0.0]}, "loop": {"mode": "sampled"}}
     law = {"t_f": 30.0, "delta": 0.5, "error": "multiplicative"}
     before = from_tables({**fast, "controller": {**law, "eta": 6.0}})
-    found, refused = judging.beside(before)
+    found, refused = judging.reference_scenarios(before)
     assert found == {"before": before}
     assert refused is not None
     assert refused.startswith("initial.rotvec_deg is")
@@ -362,10 +362,10 @@ def test_gains_are_compared_with_the_published_ones_only_if_these_can_be_simulat
     tiny = from_tables(
         {"controller": quick, "loop": {"mode": "sampled", "period": 0.001, "t_end": 0.05, "window": 0.01}}
     )
-    found, refused = judging.beside(tiny)
+    found, refused = judging.reference_scenarios(tiny)
     assert refused is None
     assert found["published"].controller.delta == 0.001  # one period, longer than the scaled delta
-    assert list(judging.beside(found["published"])[0]) == ["published"]
+    assert list(judging.reference_scenarios(found["published"])[0]) == ["published"]
 
 
 PLANTS = {
@@ -391,7 +391,7 @@ def test_default_bounds_of_every_gain_are_valid_and_contain_the_scenarios_gain(p
     names = list(getattr(law, table).gains)
     for free in (*([name] for name in names), names):
         loaded = from_tables({**tables, "tune": {"free": free}})
-        choice = Choice(loaded, loaded.search.gains, loaded.search.bounds)
+        choice = BoundsContext(loaded, loaded.search.gains, loaded.search.bounds)
         for name in free:
             (low, high), (least, most, closed) = (
                 loaded.search.bounds[name],

@@ -10,7 +10,7 @@ import pytest
 
 from tests.search.test_tuning import WITHIN, problem
 from tuning.search import hand_overs, local_search, local_searches, normalisation, starts
-from tuning.search.evaluate import Evaluator, MeasuredWithGradients
+from tuning.search.evaluate import Evaluator, MeasurementWithGradients
 
 
 class Valley(Evaluator):
@@ -21,7 +21,7 @@ class Valley(Evaluator):
         x0, x1, _ = normalised.T
         f, c = (x0 - 0.2) ** 2 + 100 * (x1 - x0**2) ** 2, np.full((len(normalised), 0, 8), -1.0)
         slope = np.stack([2 * (x0 - 0.2) - 400 * x0 * (x1 - x0**2), 200 * (x1 - x0**2), 0.0 * x0], axis=1)
-        return MeasuredWithGradients(normalised, f, c, f, slope, np.zeros((*c.shape, 3)))
+        return MeasurementWithGradients(normalised, f, c, f, slope, np.zeros((*c.shape, 3)))
 
 
 THREE = normalisation.Bounds(("eta", "k1", "sign_width"), (2.05, 0.1, 1e-5), (6.0, 50.0, 1e-1))
@@ -54,14 +54,14 @@ def test_hand_over_is_moved_to_samples_by_delta_and_by_t_f_if_both_are_free():
     run._update_best(local_search.Best(normalised, 0, 0.0), some, 0, replace_best=True)
     moved = [
         np.asarray(evaluate.bounds.gains(jnp.asarray(one)))
-        for one in hand_overs.on_samples(some, evaluate.bounds, run.normalised)
+        for one in hand_overs.points_on_samples(some, evaluate.bounds, run.normalised)
     ]
     on_samples = np.asarray([(t_f - delta) / 0.2 for t_f, delta in moved])
     np.testing.assert_allclose(on_samples, np.round(on_samples), atol=1e-9)
     with_delta = sorted(delta for t_f, delta in moved if abs(t_f - scenario_gains[0]) < 1e-9)
     np.testing.assert_allclose(with_delta, [0.73, 0.93], atol=1e-9)
     with_t_f = sorted(t_f for t_f, delta in moved if abs(delta - scenario_gains[1]) < 1e-9)
-    np.testing.assert_allclose(with_t_f, 0.79 + 0.2 * np.arange(71, 71 + hand_overs.LATER), atol=1e-9)
+    np.testing.assert_allclose(with_t_f, 0.79 + 0.2 * np.arange(71, 71 + hand_overs.SAMPLES_AHEAD), atol=1e-9)
 
 
 def test_hand_over_is_moved_to_samples_by_t_f_if_delta_is_not_free():
@@ -74,11 +74,11 @@ def test_hand_over_is_moved_to_samples_by_t_f_if_delta_is_not_free():
     )
     moved = [
         float(evaluate.bounds.gains(jnp.asarray(one))[0])
-        for one in hand_overs.on_samples(some, evaluate.bounds, run.normalised)
+        for one in hand_overs.points_on_samples(some, evaluate.bounds, run.normalised)
     ]
     delta = float(some.parts.controller.delta)
     before = np.floor((15.13 - delta) / 0.2)
-    np.testing.assert_allclose(moved, delta + 0.2 * (before + np.arange(hand_overs.LATER)), atol=1e-9)
+    np.testing.assert_allclose(moved, delta + 0.2 * (before + np.arange(hand_overs.SAMPLES_AHEAD)), atol=1e-9)
 
 
 class Conflicting(Evaluator):
@@ -99,7 +99,7 @@ class Conflicting(Evaluator):
             [np.stack(one, axis=1) for one in ((zero - 2.0, along), (zero + 1.0, along), (zero, zero))], axis=1
         )
         f_gradient = np.stack([zero + 1.0, zero], axis=1)
-        return MeasuredWithGradients(normalised, x0, c[:, :, None], x0, f_gradient, by_share[:, :, None])
+        return MeasurementWithGradients(normalised, x0, c[:, :, None], x0, f_gradient, by_share[:, :, None])
 
     measure = measure_with_gradients
 
@@ -119,7 +119,7 @@ def test_a_search_ends_at_the_best_compromise_and_finds_the_limits_that_conflict
     run.search_locally(some, {0: np.array([0.95, 0.8])})
     np.testing.assert_allclose(run.normalised, [0.5, 0.3], atol=1e-2)  # y is flat there
     np.testing.assert_allclose(run.best.worst.max(), 1.4, atol=1e-3)
-    found = run.conflict(some)
+    found = run.find_conflicts(some)
     assert list(found) == list(expected)
     for limit, alone in expected.items():
         assert found[limit] == (alone if alone is None else pytest.approx(alone, abs=2e-3))
@@ -129,12 +129,12 @@ def test_a_search_ends_at_the_best_compromise_and_finds_the_limits_that_conflict
     ("relaxed", "x0"),
     [
         (None, 0.3),  # F is least on the first limit
-        (local_search.Relaxed(to_the_end=True), 0.4),  # both are 0.2 inside their limits
+        (local_search.Relaxed(beyond_limits=True), 0.4),  # both are 0.2 inside their limits
         (
-            local_search.Relaxed(rows=[0], to_the_end=True),
+            local_search.Relaxed(rows=[0], beyond_limits=True),
             0.6,
         ),  # as far inside the first limit as the second one allows
-        (local_search.Relaxed(rows=[1], to_the_end=True), 0.3),
+        (local_search.Relaxed(rows=[1], beyond_limits=True), 0.3),
     ],
 )
 def test_a_local_search_minimises_the_objective_or_the_violation_of_some_limits(relaxed, x0):
@@ -171,7 +171,7 @@ class Narrow(Evaluator):
         f_gradient = 2.0 * np.where(near, delta - 1.1, delta - 3.5) * by_share
         broken = np.where(near, 0.3 - off, -1.0)[:, None, None]
         shape = (len(normalised), 1, problem.trials.size)
-        return MeasuredWithGradients(
+        return MeasurementWithGradients(
             gains, f, np.broadcast_to(broken, shape), f, f_gradient[:, None], np.zeros((*shape, 1))
         )
 
@@ -199,7 +199,7 @@ class Rippled(Evaluator):
         f_gradient = (0.04 * (delta - 1.8) + 0.01 * rate * np.sin(rate * delta)) * by_share
         shape = (len(normalised), 1, problem.trials.size)
         violation, slope = (np.broadcast_to(v[:, None, None], shape) for v in (1.7 - delta, -by_share))
-        return MeasuredWithGradients(gains, f, violation, f, f_gradient[:, None], slope[..., None])
+        return MeasurementWithGradients(gains, f, violation, f, f_gradient[:, None], slope[..., None])
 
     measure = measure_with_gradients
 
@@ -218,14 +218,14 @@ def test_prices_are_the_lagrange_multipliers_of_the_limits():
     """F = x0 - 2 x1 subject to x1 - x0 / 2 <= 0, on the bound x0 = 0, with a second limit that is inactive."""
     f_gradient, c_gradient = np.array([[1.0, -2.0]]), np.array([[-0.5, 1.0], [3.0, 3.0]])
     c = np.array([[[-0.3, 0.0], [-0.5, -0.2]]])
-    at = MeasuredWithGradients(
+    at = MeasurementWithGradients(
         np.zeros((1, 2)), np.zeros(1), c, np.zeros(1), f_gradient, np.stack([0 * c_gradient, c_gradient], axis=1)[None]
     )
-    np.testing.assert_allclose(local_search.multipliers(at, np.array([0.0, 0.4])), [2.0, 0.0], rtol=1e-12)
-    none = MeasuredWithGradients(
+    np.testing.assert_allclose(local_search.estimate_multipliers(at, np.array([0.0, 0.4])), [2.0, 0.0], rtol=1e-12)
+    none = MeasurementWithGradients(
         np.zeros((1, 2)), np.zeros(1), c[:, :0], np.zeros(1), f_gradient, np.zeros((1, 0, 2, 2))
     )
-    assert local_search.multipliers(none, np.array([0.0, 0.4])).size == 0
+    assert local_search.estimate_multipliers(none, np.array([0.0, 0.4])).size == 0
 
 
 def test_other_hand_overs_lie_on_samples_within_the_bounds_and_a_factor_of_two():
@@ -246,7 +246,7 @@ def test_other_hand_overs_lie_on_samples_within_the_bounds_and_a_factor_of_two()
 
 def test_only_gains_without_effect_are_reset_to_the_scenarios_values():
     """This also holds if the lower bound of sign_width depends on the observer's gain and lies above the value."""
-    hops = normalisation.Bounds(("observer_gain", *THREE.names[1:]), (2.05, 0.1, 1e-5), (600.0, 50.0, 1e-1), hop=5e-3)
+    hops = normalisation.Bounds(("observer_gain", *THREE.names[1:]), (2.05, 0.1, 1e-5), (600.0, 50.0, 1e-1), jump=5e-3)
     for bounds, width, kept in ((THREE, 2e-3, True), (THREE, 2e-3, False), (hops, 2e-3, True), (hops, 1e-3, True)):
         some, scenario_gains = replace(problem(), names=bounds.names), np.array([3.0, 5.0, width])
         run = local_searches.LocalSearches(Valley(bounds), 0.0, 40, np.random.default_rng(0))
@@ -261,7 +261,7 @@ def test_starting_points_are_the_best_far_apart_points_and_then_nearer_ones():
     normalised = np.array([[0.1, 0.1], [0.1, 0.15], [0.9, 0.1], [0.12, 0.45], [0.1, 0.1]])
     apart = starts.distances(normalised)
     np.testing.assert_allclose(apart[0], [0.0, 0.05, 0.8, 0.35, 0.0], atol=1e-12)
-    assert [starts.far_apart([1, 0, 2, 3], apart, count) for count in (1, 2, 3, 4)] == [
+    assert [starts.choose_far_apart([1, 0, 2, 3], apart, count) for count in (1, 2, 3, 4)] == [
         [1], [1, 2], [1, 2, 3], [1, 2, 3, 0],
     ]  # fmt: skip
 
@@ -277,7 +277,7 @@ def test_a_local_search_keeps_its_number_of_points_and_survives_useless_gradient
             slope = 2 * off / (1 + off @ off) * (1e30 if self.gradients == 1 else 1.0)
             slope = np.where(self.gradients == 3, np.nan, slope)
             c = np.full((1, 0, 8), -1.0)
-            return MeasuredWithGradients(
+            return MeasurementWithGradients(
                 normalised, np.array([f]), c, np.array([f]), slope[None], np.zeros((1, 0, 8, 2))
             )
 
@@ -285,7 +285,7 @@ def test_a_local_search_keeps_its_number_of_points_and_survives_useless_gradient
         start = local_search.Start(np.array([0.9, 0.1]))
         evaluate, best, path = Bowl(WITHIN), local_search.Best(start.normalised, 0, 0.0), []
         local_search.search_locally(
-            partial(evaluate.measure_with_gradients, problem()), best, start, steps, path.append, close=1e-12
+            partial(evaluate.measure_with_gradients, problem()), best, start, steps, path.append, tolerance=1e-12
         )
         assert evaluate.gradients <= steps
         assert best.f < near

@@ -16,7 +16,7 @@ from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import parts
 from tests.search.test_tuning import problem
 from tuning.search import global_check, objective, optimise, trust
-from tuning.search.evaluate import Evaluator, Measured
+from tuning.search.evaluate import Evaluator, Measurement
 from tuning.search.normalisation import Bounds
 from tuning.search.objective import FAILED
 
@@ -26,7 +26,7 @@ BOUNDS = Bounds(("eta", "delta", "t_f"), (2.5, 0.3, 15.0), (5.0, 4.0, 25.0))
 def moved_in_time(**limits):
     """Return a double integrator with noise. Its clock covers all of `BOUNDS`, so that tests share one program."""
     noisy = problem(**limits)
-    far = replace(noisy.parts, clock=clock.anchored(0.2, 21.0, 25.0, 5.0))
+    far = replace(noisy.parts, clock=clock.anchored_clock(0.2, 21.0, 25.0, 5.0))
     return replace(noisy, parts=far, names=BOUNDS.names)
 
 
@@ -53,7 +53,7 @@ def test_an_objective_that_does_not_depend_on_a_gain_is_flat(quiet):
     problem = replace(quiet, objective="peak_torque")
     z = BOUNDS.normalise(np.array([3.3, 1.0, 19.0]))
     found = trust.profiles(evaluate, problem, z)
-    assert {name: profile.flat for name, profile in found.items()} == {"eta": False, "delta": True, "t_f": False}
+    assert {name: profile.is_flat for name, profile in found.items()} == {"eta": False, "delta": True, "t_f": False}
     eta = found["eta"]
     assert np.all(np.diff(eta.gain) > 0)
     np.testing.assert_allclose(np.min(np.abs(eta.gain - 3.3)), 0.0, atol=1e-9)  # the final gain is one of the points
@@ -64,12 +64,12 @@ def test_an_objective_that_does_not_depend_on_a_gain_is_flat(quiet):
 def test_a_profile_varies_only_its_own_gain():
     """This also holds for sign_width, whose lower bound depends on the observer's gain."""
     names = ("eta", "observer_gain", "sign_width")
-    bounds = Bounds(names, (2.5, 0.5, 1e-6), (5.0, 1000.0, 0.1), hop=1e-3)
+    bounds = Bounds(names, (2.5, 0.5, 1e-6), (5.0, 1000.0, 0.1), jump=1e-3)
     found = np.array([3.0, 20.0, 1e-3])
 
-    def fly(problem: Any, normalised: np.ndarray) -> Measured:
+    def fly(problem: Any, normalised: np.ndarray) -> Measurement:
         gains, none = np.stack([bounds.gains(one) for one in normalised]), np.zeros(len(normalised))
-        return Measured(gains, none, np.zeros((len(normalised), 0, 1)), gains @ [0.0, 0.0, 1.0])
+        return Measurement(gains, none, np.zeros((len(normalised), 0, 1)), gains @ [0.0, 0.0, 1.0])
 
     evaluate: Any = SimpleNamespace(bounds=bounds, measure=fly)
     asked: Any = SimpleNamespace(rows=(), names=names)
@@ -87,11 +87,11 @@ def test_profiles_and_gradient_check_handle_failed_trials():
     """
     bounds = Bounds(("k",), (0.01,), (1.0,))
 
-    def fly(problem: Any, normalised: np.ndarray) -> Measured:
+    def fly(problem: Any, normalised: np.ndarray) -> Measurement:
         gains = np.stack([bounds.gains(one) for one in normalised])
         c = np.where(gains[:, None, :] < [0.5, 0.25], FAILED - 1.0, -0.5)
         value = np.log(np.where(gains[:, 0] < 0.25, FAILED, 1e-3))
-        return Measured(gains, value + np.log(FAILED) * (c[:, 0] > 0.0).sum(axis=1), c, value)
+        return Measurement(gains, value + np.log(FAILED) * (c[:, 0] > 0.0).sum(axis=1), c, value)
 
     def measure_with_gradients(problem: Any, normalised: np.ndarray) -> Any:
         return SimpleNamespace(f_gradient=np.zeros_like(normalised))
@@ -101,8 +101,8 @@ def test_profiles_and_gradient_check_handle_failed_trials():
     found = trust.profiles(evaluate, asked, bounds.normalise(np.array([0.7])))["k"]
     np.testing.assert_array_equal(found.violation_ratio <= 1.0, found.gain >= 0.5)
     np.testing.assert_array_equal(np.isnan(found.value), found.gain < 0.25)
-    assert found.seen
-    assert not found.flat
+    assert found.has_value
+    assert not found.is_flat
     assert np.isnan(trust.gradient_error(evaluate, asked, bounds.normalise(np.array([0.1]))))
     assert trust.gradient_error(evaluate, asked, bounds.normalise(np.array([0.7]))) == 0.0
 
@@ -133,10 +133,10 @@ def test_a_zero_gain_has_no_sensitivity_and_the_other_gains_have_one(monkeypatch
 @pytest.mark.parametrize(("ratio", "flat"), [(1.0, True), (1.005, True), (1.02, False), (3.0, False)])
 def test_a_gain_is_flat_if_objective_and_limits_change_by_less_than_one_percent(ratio, flat):
     ones, moved = np.ones(3), np.array([2.0, 2.0 * ratio, 2.0])
-    assert trust.Profile(ones, moved, ones, np.log(moved)).flat == flat
-    assert trust.Profile(ones, ones, moved, 0.0 * ones).flat == flat  # constant objective such as t_f
-    assert trust.Profile(ones, ones, ones, np.log(moved)).flat == flat  # torque term of F
-    assert trust.Profile(ones, moved, 0.0 * ones, np.log(moved)).flat == flat  # no requirements
+    assert trust.Profile(ones, moved, ones, np.log(moved)).is_flat == flat
+    assert trust.Profile(ones, ones, moved, 0.0 * ones).is_flat == flat  # constant objective such as t_f
+    assert trust.Profile(ones, ones, ones, np.log(moved)).is_flat == flat  # torque term of F
+    assert trust.Profile(ones, moved, 0.0 * ones, np.log(moved)).is_flat == flat  # no requirements
 
 
 def test_gradients_are_checked_against_finite_differences():
@@ -185,7 +185,7 @@ def test_equal_or_too_few_values_have_no_interval():
 def test_differential_evolution_finds_the_same_optimum(monkeypatch):
     monkeypatch.setattr(global_check, "GENERATIONS", 30)
     run = parts(20.0, 3.0, 0.5, period=0.2, noise=(2e-5, 1e-6), t_end=21.0)
-    run = replace(run, clock=clock.anchored(0.2, 21.0, 20.0, 5.0))
+    run = replace(run, clock=clock.anchored_clock(0.2, 21.0, 20.0, 5.0))
     nothing = variation.Dispersion()
     some = objective.problem(run, nothing, 3, np.arange(4), ("eta", "delta"), [Requirement("peak_torque", 0.6)])
     evaluate = Evaluator(Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0)))
@@ -236,7 +236,7 @@ class Steps:
         self.rollouts += len(normalised)
         self.judged += len(normalised) * (problem.margins is not None)
         f = np.where(normalised[:, 0] > 0.9, np.inf, 3.0 + normalised[:, 0])
-        return Measured(2.0 + normalised, f, self.c(problem, normalised)[:, :, None], f)
+        return Measurement(2.0 + normalised, f, self.c(problem, normalised)[:, :, None], f)
 
 
 def test_the_global_check_uses_the_tightened_limits_of_the_search(monkeypatch):

@@ -35,7 +35,7 @@ from tuning.search import (
     starts,
     worst,
 )
-from tuning.search.evaluate import Evaluator, Measured, MeasuredWithGradients
+from tuning.search.evaluate import Evaluator, Measurement, MeasurementWithGradients
 from tuning.studies import posing, tune_files
 
 TURNED = random_turns(np.deg2rad(20.0), np.deg2rad(140.0))
@@ -55,7 +55,7 @@ def loss(request):
         model, wave = integrator_chain.chain(2), disturbances.Sinusoid(*(vector([v]) for v in (0.01, 0.1, 0.0, 0.0)))
         observer = nonlinear.NonlinearObserver(model, vector([10.0]), vector(1e-3), vector(0.0))
         run = chain_parts([1.0, 0.0], noise=[2e-5, 1e-6], disturbance=wave, observer=observer)
-        run = replace(run, clock=clock.anchored(0.1, 23.0, 23.0, 6.0), t_end=vector(23.0))
+        run = replace(run, clock=clock.anchored_clock(0.1, 23.0, 23.0, 6.0), t_end=vector(23.0))
     else:
         run = parts(20.0, 3.0, 0.5, period=0.1, noise=(2e-5, 1e-6), t_end=23.0, reach=(23.0, 3.0))
     drawn = {"chain": SPREAD, "spacecraft": TURNED}[request.param]
@@ -137,24 +137,24 @@ def test_the_lower_bound_of_sign_width_depends_on_the_observer_gain():
     table = {"loop": {"mode": "sampled", "period": 0.05}, "hardware": {"rate_noise": 1e-6}, "tune": tune}
     made = scenario.from_tables(table)
     ready = scenario.study(made)
-    some = normalisation.of_scenario(made, ready.parts)
+    some = normalisation.bounds_of_scenario(made, ready.parts)
     for l_gain in (10.0, 100.0):
         moved = gains.with_gains(ready.parts, {"observer_gain": l_gain})
         normalised = some.normalise(np.array([3.0, 0.5, l_gain, 1.0, 1e-9]))
         assert normalised[4] == 0.0
         width = some.gains(jnp.asarray(normalised))[4]
-        np.testing.assert_allclose(width, envelopes.narrowest_sign(moved, 0.05) / 2, rtol=1e-12)
+        np.testing.assert_allclose(width, envelopes.smallest_sign_width(moved, 0.05) / 2, rtol=1e-12)
         inside = np.append(normalised[:4], 0.3)
         np.testing.assert_allclose(some.normalise(np.asarray(some.gains(jnp.asarray(inside)))), inside, rtol=1e-9)
     # bounds from the scenario file do not change
     given = scenario.replace(made, tune=tune | {"bounds": {"sign_width": [1e-7, 1e-2]}})
-    assert normalisation.of_scenario(given, ready.parts).hop == 0.0
+    assert normalisation.bounds_of_scenario(given, ready.parts).jump == 0.0
 
 
 def test_the_lower_bound_of_sign_width_depends_on_the_slowest_observer_axis():
     """If each axis has its own observer gain, K2 depends on the smallest one."""
     names = ("observer_gain_1", "sign_width", "observer_gain_2")
-    some = normalisation.Bounds(names, (5.0, 1e-6, 5.0), (80.0, 1.0, 80.0), hop=0.2)
+    some = normalisation.Bounds(names, (5.0, 1e-6, 5.0), (80.0, 1.0, 80.0), jump=0.2)
     for slow in (0, 2):
         normalised = np.where(np.arange(3) == slow, 0.25, 0.75)
         normalised[1] = 0.0
@@ -186,7 +186,7 @@ def problem(count=8, dispersion=SPREAD, may_break=None, **limits):
         run = chain_parts([25.0, 0.0], 20.0, 3.0, 0.5, period=0.2, noise=[5e-4, 2.5e-5])
     else:
         run = parts(20.0, 3.0, 0.5, period=0.2, noise=(2e-5, 1e-6), t_end=21.0)
-    run = replace(run, clock=clock.anchored(0.2, 21.0, 20.0, 5.0), t_end=vector(21.0))
+    run = replace(run, clock=clock.anchored_clock(0.2, 21.0, 20.0, 5.0), t_end=vector(21.0))
     wanted = [Requirement(metric, limit) for metric, limit in (FAR_OFF | limits).items()]
     may_break = None if may_break is None else (may_break, None, None)
     return objective.problem(run, dispersion, 3, np.arange(count), WITHIN.names, wanted, may_break)
@@ -288,7 +288,7 @@ def test_statistic_of_a_scenario_sets_the_tail_and_requirements_set_the_held_out
     for kind, tail in tables.items():
         table = scenario.from_tables({"tune": {"statistic": kind}}).tune
         assert table is not None
-        assert posing._tail(table, 64) == tail
+        assert posing._count_tail_trials(table, 64) == tail
 
 
 NEAR = random_turns(np.pi - 1e-5, np.pi)  # next to the law's singularity
@@ -320,7 +320,7 @@ def test_a_large_violation_does_not_count_as_a_failed_trial(monkeypatch):
     found = optimise.search(evaluate, some, wanted, np.array([3.0, 0.5]), settings)
     assert found.worst[2] > local_search.FAILURE_PENALTY
     assert found.worst[:2].max() < 1.0
-    np.testing.assert_array_equal(found.worst, found.ended)
+    np.testing.assert_array_equal(found.worst, found.worst_completed)
     assert list(found.conflict) == ["window_error"]
 
 
@@ -329,7 +329,7 @@ def test_a_search_whose_limit_is_out_of_reach_adds_no_trials(monkeypatch, count)
     """Harder trials cannot help. A search from several starting points continues with a global search."""
     helpers.small_search(monkeypatch)
     monkeypatch.setattr(worst, "SCREENED", 16)
-    monkeypatch.setattr(rounds.Rounds, "harder", lambda *_: pytest.fail("harder"))
+    monkeypatch.setattr(rounds.Rounds, "add_harder_trials", lambda *_: pytest.fail("harder"))
     seeds = []
 
     def search_globally(run, some, count, seed):
@@ -348,7 +348,7 @@ def test_a_search_whose_limit_is_out_of_reach_adds_no_trials(monkeypatch, count)
 def test_a_failed_trial_is_worse_than_any_violation(far):
     """At the first of two points, one of two trials fails. At the second point, both violations are larger."""
     c = np.asarray([[[0.4 * far, objective.FAILED - 1.0]], [[far, far]]])
-    seen = Measured(np.zeros((2, 1)), np.asarray([1.0, 2.0]), c, np.zeros(2))
+    seen = Measurement(np.zeros((2, 1)), np.asarray([1.0, 2.0]), c, np.zeros(2))
     normalised = np.asarray([[0.2], [0.8]])
     for order in ([0, 1], [1, 0]):
         best = local_search.Best(np.zeros(1), 1, 0.0)
@@ -364,7 +364,7 @@ def test_search_agrees_with_a_brute_force_scan(monkeypatch):
     """The scan covers the same problem, almost without screening for harder trials."""
     helpers.small_search(monkeypatch)
     monkeypatch.setattr(worst, "SCREENED", 16)
-    monkeypatch.setattr(starts, "SWEPT", 64)
+    monkeypatch.setattr(starts, "CANDIDATES", 64)
     some = problem(peak_torque=1.4)
     wanted = (Requirement("peak_torque", 1.4),)
     seen = []
@@ -427,8 +427,10 @@ def test_a_global_search_follows_if_harder_trials_lead_beyond_a_limit(monkeypatc
             raise KeyboardInterrupt
 
     joins = iter([True])  # once, without adding a trial
-    monkeypatch.setattr(rounds.Rounds, "harder", lambda self, *_: next(joins, False) and not vars(self).update(count=1))
-    monkeypatch.setattr(local_searches.LocalSearches, "again", end_lost)
+    monkeypatch.setattr(
+        rounds.Rounds, "add_harder_trials", lambda self, *_: next(joins, False) and not vars(self).update(count=1)
+    )
+    monkeypatch.setattr(local_searches.LocalSearches, "continue_best", end_lost)
     monkeypatch.setattr(local_searches.LocalSearches, "search_globally", search_globally)
     monkeypatch.setattr(local_searches.LocalSearches, "search_locally", search_locally)
     found = optimise.search(evaluate, some, wanted, np.array([3.0, 0.5]), optimise.Settings(2, 10, 1))
@@ -452,8 +454,8 @@ def test_a_global_search_follows_if_harder_trials_lead_beyond_a_limit(monkeypatc
 def test_gains_with_the_largest_effect_on_active_limits_are_held_except_for_two(rows, held):
     c = np.array([[[violation - 0.5, violation] for violation, _ in rows]])  # the second of two trials has the larger c
     slope = np.array([[[np.full(4, 1e3), np.asarray(by)] for _, by in rows]])
-    seen = MeasuredWithGradients(np.zeros((1, 4)), np.zeros(1), c, np.zeros(1), np.zeros((1, 4)), slope)
-    assert starts.held_by_limits(seen) == held
+    seen = MeasurementWithGradients(np.zeros((1, 4)), np.zeros(1), c, np.zeros(1), np.zeros((1, 4)), slope)
+    assert starts.find_decisive_gains(seen) == held
 
 
 def test_a_problem_with_fewer_trials_keeps_added_trials_and_fractions():
@@ -475,7 +477,7 @@ def test_a_problem_with_fewer_trials_keeps_added_trials_and_fractions():
 ])  # fmt: skip
 def test_only_a_discontinuous_sign_leads_to_a_search_without_gradients(width, free, with_gradients):
     tables = {"loop": {"mode": "sampled"}, "controller": {"sign_width": width}, "tune": {"free": free, "trials": 4}}
-    posed = posing.tuning_problem(scenario.from_tables(tables), 0)
+    posed = posing.set_up_tuning(scenario.from_tables(tables), 0)
     assert posed.with_gradients == with_gradients
     assert float(posed.problem.parts.controller.sign_width) == width
 
@@ -483,7 +485,7 @@ def test_only_a_discontinuous_sign_leads_to_a_search_without_gradients(width, fr
 def test_a_search_without_gradients_finds_the_same_optimum(monkeypatch):
     """Both kinds of search minimise the same objective, for a law with useful gradients."""
     helpers.small_search(monkeypatch)
-    monkeypatch.setattr(local_searches, "MANY", 64)
+    monkeypatch.setattr(local_searches, "SOBOL_POINTS", 64)
     monkeypatch.setattr(evolution, "GENERATIONS", 25)
     found, evaluates = {}, {with_gradients: Evaluator(WITHIN) for with_gradients in (True, False)}
     for with_gradients, evaluate in evaluates.items():
@@ -540,7 +542,7 @@ def test_shortest_t_f_for_a_torque_limit_agrees_with_theory(plant, monkeypatch):
         q = [0.0, 0.0, np.sin(theta / 2), np.cos(theta / 2)]
         run = parts(20.0, eta, 1.0, q=q, period=0.2, t_end=21.0, disturbance=disturbances.Constant(jnp.zeros(3)))
         moved = 2 * 14.0 * np.tan(theta / 2)
-    run = replace(run, clock=clock.anchored(0.2, 21.0, 40.0, 5.0), t_end=vector(21.0))
+    run = replace(run, clock=clock.anchored_clock(0.2, 21.0, 40.0, 5.0), t_end=vector(21.0))
     wanted = [Requirement("peak_torque", limit)]
     some = objective.problem(run, variation.Dispersion(), 3, np.arange(1), ("t_f", "delta"), wanted, objective="t_f")
     evaluate = Evaluator(normalisation.Bounds(("t_f", "delta"), (8.0, 0.4), (40.0, 4.0)))

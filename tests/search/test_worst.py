@@ -31,7 +31,7 @@ def posed(dispersion, requirement=None, settling_angle=4.0, **others):
     start.
     """
     run = parts(T_F, ETA, 1.0, period=0.2, t_end=21.0, disturbance=sine(0.0), **others)
-    run = replace(run, clock=clock.anchored(0.2, 21.0, T_F, 5.0), settling_angle=vector(settling_angle))
+    run = replace(run, clock=clock.anchored_clock(0.2, 21.0, T_F, 5.0), settling_angle=vector(settling_angle))
     asked = requirement or Requirement("peak_torque", LIMIT)
     wanted = [asked if asked.metric == name else Requirement(name, limit) for name, limit in FAR.items()]
     wanted += [asked] if asked.metric not in FAR else []
@@ -49,7 +49,7 @@ def first_torque(inertia, theta, eta=ETA):
 
 
 def test_a_search_computes_only_the_pointing_metrics_that_its_problem_needs():
-    observed = pointing.Pointing(vector(*pointing.across([0.0, 0.0, 1.0])), vector(0.1), vector(0.4))
+    observed = pointing.Pointing(vector(*pointing.boresight_frame([0.0, 0.0, 1.0])), vector(0.1), vector(0.4))
     spread = random_turns(0.1, 2.0)
     problem, _ = posed(spread, Requirement("ape_z", 1e-3))
     problem = replace(problem, parts=replace(problem.parts, pointing=observed))
@@ -74,7 +74,7 @@ def test_the_worst_attitude_agrees_with_theory(inertia):
     smallest, largest = np.deg2rad(20.0), np.deg2rad(140.0)
     spread = random_turns(smallest, largest)
     problem, wanted = posed(spread, inertia=inertia)
-    found = worst.hardest(problem, wanted, np.array([ETA, 1.0]))
+    found = worst.find_hardest(problem, wanted, np.array([ETA, 1.0]))
     tensor = np.diag(inertia) if np.ndim(inertia) == 1 else np.asarray(inertia)
     expected = first_torque(tensor, largest) / LIMIT
     # the error of a maximum is of second order in the last steps of 1e-2
@@ -97,7 +97,7 @@ def test_random_attitudes_are_differentiable_with_respect_to_their_coordinates()
     y = np.array([[0.3, 0.6, 0.2], [0.7, 0.9, 1.0]])
 
     def moved(y):
-        return worst._moved(spread, {name: y}, y, (name,))
+        return worst._to_coordinates(spread, {name: y}, y, (name,))
 
     def turns(y):
         drawn = [spread.at(problem.parts, {name: one}).initial.q for one in moved(y)[0][name]]
@@ -126,7 +126,7 @@ def swinging(x0, std, amplitude, settling_angle=1e9, **limits):
     """
     acting = disturbances.Sinusoid(*(vector([v]) for v in (amplitude, 0.1, 0.0, 0.0)))
     run = chain_parts([x0, 0.0], T_F, ETA, 1.0, period=0.2, disturbance=acting)
-    run = replace(run, clock=clock.anchored(0.2, 21.0, T_F, 5.0), t_end=vector(21.0))
+    run = replace(run, clock=clock.anchored_clock(0.2, 21.0, T_F, 5.0), t_end=vector(21.0))
     run = replace(run, settling_angle=vector(settling_angle))
     spread = variation.Dispersion({
         "initial_state": RandomNumbers("normal", vector(std)),
@@ -143,9 +143,9 @@ def test_normal_numbers_are_searched_within_a_ball_of_high_probability():
     from scipy.stats import chi2
 
     problem, wanted = swinging(0.0, [1e-9, 1e-3], 0.0, peak_rate=0.05)
-    found = worst.hardest(problem, wanted, np.array([ETA, 1.0]))
+    found = worst.find_hardest(problem, wanted, np.array([ETA, 1.0]))
     size = np.linalg.norm(found.coordinates["initial_state"])
-    np.testing.assert_allclose(size, np.sqrt(chi2.ppf(worst.HELD, 2)), rtol=1e-8)  # on the surface of the ball
+    np.testing.assert_allclose(size, np.sqrt(chi2.ppf(worst.PROBABILITY, 2)), rtol=1e-8)  # on the surface of the ball
     # the first number has a millionth of the effect of the second one, and a corresponding part of the radius
     np.testing.assert_allclose(abs(found.start["initial_x2"]), 1e-3 * size, rtol=1e-8)
     np.testing.assert_allclose(found.ratio, 1e-3 * size / 0.05, rtol=1e-8)  # the initial rate is the peak rate
@@ -157,10 +157,10 @@ def test_normal_numbers_stay_just_inside_their_ball():
     With a gradient, the normal numbers move to the point of the sphere in its direction.
     """
     y, normal = np.array([[9.0, 0.6, 0.8], [9.0, 3.0, 4.0]]), [(slice(1, 3), 2.0)]
-    inside = worst._within(y, normal)
+    inside = worst._move_into_balls(y, normal)
     np.testing.assert_allclose(inside, [y[0], [9.0, 1.2, 1.6]], rtol=1e-8)
     assert np.linalg.norm(inside[1, 1:]) < 2.0
-    turned = worst._within(y, normal, np.array([[5.0, 3.0, -4.0], [5.0, 0.0, 0.0]]))
+    turned = worst._move_into_balls(y, normal, np.array([[5.0, 3.0, -4.0], [5.0, 0.0, 0.0]]))
     np.testing.assert_allclose(turned, [[9.0, 1.2, -1.6], [9.0, 1.2, 1.6]], rtol=1e-8)  # zero gradient: no change
     assert np.all(np.linalg.norm(turned[:, 1:], axis=1) < 2.0)
     assert y[1, 1] == 3.0
@@ -170,7 +170,7 @@ def test_the_worst_actuator_scale_is_found_by_gradients():
     """The first delivered torque of a chain is eta^2 x / t_f^2 times the scale factor. Jitter has no effect on it."""
     limit = 0.01
     problem, wanted = swinging(1.0, [0.0, 0.0], 0.0, peak_torque_delivered=limit)
-    found = worst.hardest(problem, wanted, np.array([ETA, 1.0]))
+    found = worst.find_hardest(problem, wanted, np.array([ETA, 1.0]))
     assert set(found.moved) == set(problem.dispersion.kinds)
     np.testing.assert_allclose(found.ratio, (1.0 + EDGE) * ETA**2 / T_F**2 / limit, rtol=1e-6)
     assert found.screened < found.ratio
@@ -193,7 +193,7 @@ def test_gradients_of_the_ascent_agree_with_finite_differences(what):
     at = np.array([ETA, 1.0])
 
     def ratio_with_gradient(y):
-        return worst.ratio_with_gradient(batch, at, y, objective.watched(problem), limits)
+        return worst.ratio_with_gradient(batch, at, y, objective.needed_metrics(problem), limits)
 
     slope = ratio_with_gradient(y)[1]
     assert slope.shape == y.shape == (3, 3 if what == "attitudes" else 5)
@@ -225,8 +225,8 @@ def test_a_robust_search_keeps_the_limit_in_the_worst_case(monkeypatch, plant):
     )
     assert robust.hardest is not None
     assert plain.hardest is not None
-    assert robust.hardest.ratio <= 1.0 + worst.NEAR
-    assert robust.gains[0] <= eta * (1 + worst.NEAR)
+    assert robust.hardest.ratio <= 1.0 + worst.LIMIT_TOLERANCE
+    assert robust.gains[0] <= eta * (1 + worst.LIMIT_TOLERANCE)
     np.testing.assert_allclose(robust.gains[0], eta, rtol=0.01)  # it loses only the margin
     np.testing.assert_allclose(plain.hardest.ratio, (plain.gains[0] / eta) ** 2, rtol=5e-3)
 
@@ -254,9 +254,9 @@ def test_given_coordinates_are_simulated_as_random_ones():
     more = objective.with_trials(problem, np.asarray([40]))
     drawn_ones = objective.coordinates_of(problem.dispersion, 5, np.asarray([40]))
     drawn = {name: np.asarray(v)[0].tolist() for name, v in drawn_ones.items()}
-    roomy = rounds._with_room(problem, rounds.SPARE_SLOTS)
+    roomy = rounds._add_slots(problem, rounds.SPARE_SLOTS)
     assert roomy.trials.size == 8 + rounds.SPARE_SLOTS
-    given = rounds._add(roomy, np.array([8]), rounds.Joining(np.asarray([7]), np.array([True]), drawn))
+    given = rounds._fill_slots(roomy, np.array([8]), rounds.Joining(np.asarray([7]), np.array([True]), drawn))
     assert roomy.trials[8] == roomy.trials[0]  # the original is not changed
     evaluate = Evaluator(Bounds(problem.names, (2.5, 0.3), (6.0, 4.0)))
     normalised = evaluate.bounds.normalise(np.array([3.2, 0.9]))[None]
@@ -317,13 +317,13 @@ def test_the_hardest_screened_trial_is_the_worst_case_if_nothing_can_be_moved():
     spread = variation.Dispersion(
         {"initial_attitude": numbers.any_attitude(), "inertia": inertias.RelativeInertia(*body)}
     )
-    assert simulations.movable(spread) == ("initial_attitude",)
+    assert simulations.differentiable_dispersions(spread) == ("initial_attitude",)
     run = chain_parts([1.0, 0.0], T_F, ETA, 1.0, period=0.2, noise=[1e-2, 1e-3])
-    run = replace(run, clock=clock.anchored(0.2, 21.0, T_F, 5.0), t_end=vector(21.0))
+    run = replace(run, clock=clock.anchored_clock(0.2, 21.0, T_F, 5.0), t_end=vector(21.0))
     wanted = [Requirement("peak_rate", 0.1)]
     problem = objective.problem(run, variation.Dispersion(), 5, np.arange(8), ("eta", "delta"), wanted)
     at = np.array([ETA, 1.0])
-    found = worst.hardest(problem, wanted, at)
+    found = worst.find_hardest(problem, wanted, at)
     trials, ratio = worst.screen(problem, wanted, at)
     assert trials[0] == problem.averaged  # no training trial
     assert found.moved == ()
@@ -349,7 +349,7 @@ def test_a_trial_without_a_metric_is_the_hardest(plant):
     _, ratio = worst.screen(problem, wanted, at)
     assert 0 < np.isinf(ratio).sum() < ratio.size
     assert not np.isnan(ratio).any()
-    found = worst.hardest(problem, wanted, at)
+    found = worst.find_hardest(problem, wanted, at)
     assert found.status in ("ok", "not_converged")
     assert (found.ratio, found.breaks_limit, found.unbounded) == (np.inf, True, False)
     evaluate = Evaluator(Bounds(problem.names, (2.5, 0.3), (6.0, 4.0)))
@@ -361,7 +361,7 @@ def test_a_trial_without_a_metric_is_the_hardest(plant):
 def test_failing_trials_have_no_worst_case():
     """The squares of the initial states overflow."""
     problem, wanted = swinging(1.0, [1e160, 0.0], 0.0)
-    found = worst.hardest(problem, wanted, np.array([ETA, 1.0]))
+    found = worst.find_hardest(problem, wanted, np.array([ETA, 1.0]))
     assert found.unbounded
     told = {
         status: replace(found, status=status).unbounded for status in ("ok", "not_converged", "singular", "diverged")

@@ -35,13 +35,13 @@ def test_rounding_does_not_move_the_end_of_an_anchored_clock(period, t_f, delta,
     t_end = t_f + after
     whole = round((t_end - t_f + delta) / period)
     assert 0.0 < t_end - (t_f - delta + whole * period) < 1e-14
-    ticks = ticks_of(clock.anchored(period, t_end, t_f, t_end - t_f + delta), vector(t_f), vector(delta))
+    ticks = ticks_of(clock.anchored_clock(period, t_end, t_f, t_end - t_f + delta), vector(t_f), vector(delta))
     assert float(ticks.t_next[-1]) == t_end
 
 
 @pytest.mark.parametrize("periods", [10, 20])
 def test_anchored_ticks_are_continuous_at_multiples_of_the_period(periods):
-    anchored = clock.anchored(0.1, 15.0, 10.0, 8.0)
+    anchored = clock.anchored_clock(0.1, 15.0, 10.0, 8.0)
 
     def ends(delta):
         ticks = ticks_of(anchored, vector(10.0), delta)
@@ -59,7 +59,7 @@ def test_anchored_ticks_are_continuous_at_multiples_of_the_period(periods):
 @pytest.mark.parametrize(("t_f", "delta"), [(12.0, 0.7), (30.3, 0.9), (12.0, 0.8), (30.0, 0.7)])
 def test_rounding_adds_no_sample_just_after_the_first_sample(t_f, delta):
     """12.0 - 0.7 is 8e-17 s beyond 113 periods. An earlier version had two samples at t = 0 and wrong gradients."""
-    anchored = clock.anchored(0.1, t_f + 4.03, t_f, 6.0)
+    anchored = clock.anchored_clock(0.1, t_f + 4.03, t_f, 6.0)
 
     @jax.jit  # has other rounding errors
     def starts(delta):
@@ -80,7 +80,7 @@ def test_rounding_adds_no_sample_just_after_the_first_sample(t_f, delta):
 @pytest.mark.parametrize(("delta", "t_end"), [(0.6, 8.3), (0.9, 8.3), (0.6, 10.3), (0.8, 8.3)])
 def test_rounding_adds_no_sample_just_before_the_end(delta, t_end):
     """7.3 - 0.6 s and 16 periods are 2e-15 s before 8.3 s. Earlier, this added a sample and changed gradients."""
-    anchored = clock.anchored(0.1, t_end, 7.3, 5.0)
+    anchored = clock.anchored_clock(0.1, t_end, 7.3, 5.0)
 
     def lengths(delta):
         ticks = ticks_of(anchored, vector(7.3), delta)
@@ -118,14 +118,14 @@ def test_a_whole_first_period_has_the_derivatives_of_a_slightly_larger_delta(t_f
 
 
 def test_the_noise_of_a_partial_first_period_includes_noise_of_the_next_sample():
-    ticks = ticks_of(clock.anchored(0.1, 15.0, 10.0, 8.0), vector(10.0), vector(1.07))
+    ticks = ticks_of(clock.anchored_clock(0.1, 15.0, 10.0, 8.0), vector(10.0), vector(1.07))
     first = int(np.flatnonzero(np.asarray(ticks.t_next) > 0)[0])
     np.testing.assert_allclose(ticks.t_next[first] - ticks.t[first], 0.03, atol=1e-12)
     np.testing.assert_allclose(ticks.noise_weight[first], 0.3, atol=1e-10)
 
 
 def test_the_flight_clock_starts_at_zero_and_hands_over_at_the_first_sample_from_t_s_on():
-    flight = clock.flight(0.1, 15.04)
+    flight = clock.flight_clock(0.1, 15.04)
     ticks = ticks_of(flight, vector(10.0), vector(1.07))
     np.testing.assert_allclose(ticks.t[:150], 0.1 * np.arange(150), rtol=1e-15)
     assert float(ticks.t_next[-1]) == 15.04
@@ -137,7 +137,7 @@ def test_the_flight_clock_starts_at_zero_and_hands_over_at_the_first_sample_from
 @pytest.mark.parametrize(("t_f", "delta"), [(30.0, 0.05), (0.5, 0.001), (3000.0, 2.0), (10.0, 5.0)])
 def test_the_graded_grid_has_the_documented_nodes_and_steps(t_f, delta):
     saves = [0.3 * t_f, t_f - delta, t_f + 0.5]
-    grid = clock.graded(t_f, delta, t_f + 10.0, 1.0, 1.0, 0.1, (1e-3 * t_f, 1e-3), saves)
+    grid = clock.graded_clock(t_f, delta, t_f + 10.0, 1.0, 1.0, 0.1, (1e-3 * t_f, 1e-3), saves)
     ticks = ticks_of(grid, vector(t_f), vector(delta))
     t, t_next = np.asarray(ticks.t), np.asarray(ticks.t_next)
     assert np.all(t_next >= t)
@@ -160,7 +160,7 @@ def test_the_graded_grid_has_the_documented_nodes_and_steps(t_f, delta):
 
 
 def test_graded_nodes_have_exact_derivatives_in_t_f_and_delta():
-    grid = clock.graded(30.0, 0.05, 45.0, 1.0, 1.0, 0.1, (3.0, 0.1))
+    grid = clock.graded_clock(30.0, 0.05, 45.0, 1.0, 1.0, 0.1, (3.0, 0.1))
 
     def nodes(t_f, delta):
         return ticks_of(grid, t_f, delta).t
@@ -184,7 +184,11 @@ def test_rounding_removes_no_period_in_32_or_64_bits(bits):
 
     def handed_over(period, t_end, t_f, delta):
         ticks = clock.Flight(period, t_end, count).ticks(t_f, delta)
-        return jnp.argmax(ticks.hold), rollout._gap(ticks, t_end), rollout._gap(ticks, t_end + 0.5 * period)
+        return (
+            jnp.argmax(ticks.hold),
+            rollout._first_time_without_samples(ticks, t_end),
+            rollout._first_time_without_samples(ticks, t_end + 0.5 * period),
+        )
 
     with jax.enable_x64(bits == 64):
         many = jax.jit(jax.vmap(jax.vmap(handed_over)))

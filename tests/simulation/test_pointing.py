@@ -85,7 +85,7 @@ def tallied(nodes, error, rate, begins, window, limits, segments=33):
 
     def step(tally, row):
         t, t_next, start, start_rate, end, end_rate = row
-        path = pointing.hermite(start, start_rate, end, end_rate, t_next - t)
+        path = pointing.hermite_path(start, start_rate, end, end_rate, t_next - t)
         return pointing.update(tally, path, t, t_next, begins, window, limits), None
 
     rows = nodes[:-1], nodes[1:], error[:-1], rate[:-1], error[1:], rate[1:]
@@ -180,7 +180,7 @@ def check_the_cone(seed):
     """Compare with the angle between both boresights, and with the rotation vector of SciPy."""
     rng = np.random.default_rng(seed)
     b = rng.normal(size=3)
-    frame = pointing.across(b)
+    frame = pointing.boresight_frame(b)
     np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-14)
     target = Rotation.from_rotvec(rng.normal(size=3))
     off = Rotation.from_rotvec(rng.normal(size=3) * 10.0 ** rng.uniform(-9, -0.5))
@@ -198,7 +198,7 @@ test_the_half_cone_is_the_angle_of_the_boresight = drawn(check_the_cone, 20, see
 @pytest.mark.parametrize("angle", [1.0, 2.0, 2.5, 3.0, 3.14, np.pi - 2e-6, np.pi])
 def test_boresight_errors_can_exceed_a_right_angle(angle):
     """The rotation is up to 180 deg about an axis across the boresight. At 180 deg any axis is right."""
-    frame = pointing.across([1.0, -2.0, 0.5])
+    frame = pointing.boresight_frame([1.0, -2.0, 0.5])
     off = Rotation.from_rotvec(angle * (0.6 * frame[1] + 0.8 * frame[2]))
     error = pointing.attitude_error(vector(off.as_quat()), vector([0.0, 0.0, 0.0, 1.0]), vector(frame))
     assert float(jnp.linalg.norm(error[3:])) == pytest.approx(angle, rel=1e-9)
@@ -318,17 +318,17 @@ def test_a_window_with_too_many_samples_has_no_fraction_of_time():
 
 
 def test_a_continuous_run_has_room_for_all_its_steps():
-    frame = pointing.across((0.0, 0.0, 1.0))
+    frame = pointing.boresight_frame((0.0, 0.0, 1.0))
     zero, one = jnp.zeros(()), jnp.ones(())
     asked = pointing.Pointing(jnp.asarray(frame), zero, one, {"rpe_z": one})
-    assert asked.of_run(700).segments("rpe") == 702
-    assert asked.of_run(700).segments("rke") == 0
-    assert dataclasses.replace(asked, samples=12).of_run(700).segments("rpe") == 14
+    assert asked.for_run(700).segment_count("rpe") == 702
+    assert asked.for_run(700).segment_count("rke") == 0
+    assert dataclasses.replace(asked, samples=12).for_run(700).segment_count("rpe") == 14
 
 
 def test_gradients_of_indices_match_finite_differences():
     """The direction changes attitudes, rates, times of nodes and the begin of the observation together."""
-    rng, frame = np.random.default_rng(5), vector(pointing.across((1.0, 2.0, -0.5)))
+    rng, frame = np.random.default_rng(5), vector(pointing.boresight_frame((1.0, 2.0, -0.5)))
     decay = np.exp(-0.3 * NODES)[:, None]  # so that the first window and its first moment are among the largest
     turns, aside = (vector(0.01 * decay * (1.0 + 0.1 * rng.normal(size=(NODES.size, 3)))) for _ in range(2))
     rates, none = 0.01 * rng.normal(size=(NODES.size, 5)), np.full((3, 4), np.inf)

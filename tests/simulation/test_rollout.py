@@ -31,7 +31,7 @@ from tests.helpers import (
 )
 
 # 20 s before the hand-over and 11 s after it
-TIGHT = clock.anchored(0.25, 30.0, 20.0, 11.0)
+TIGHT = clock.anchored_clock(0.25, 30.0, 20.0, 11.0)
 
 
 def at_20_hz(*gains) -> rollout.Parts:
@@ -363,7 +363,7 @@ def test_a_single_run_is_compiled_with_optimisation_only_if_it_is_long(monkeypat
     monkeypatch.setattr(rollout, "simulate_once", once := object())
     run = parts(30.0, period=0.01, t_end=31.0)
     assert rollout.single_run_program(run) is once
-    longer = replace(run, clock=clock.flight(1e-3, 31.0))
+    longer = replace(run, clock=clock.flight_clock(1e-3, 31.0))
     assert rollout.single_run_program(longer) is rollout.simulate_parts
 
 

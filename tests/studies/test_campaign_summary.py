@@ -29,7 +29,7 @@ def test_outcomes_distinguish_requirements_that_allow_violations_for_some_time(i
         assert campaign_figures._outcomes(FRAME, both).tolist() == [BEYOND, *outcomes[1:]]
     values, within = FRAME["ape_z"].to_numpy(), FRAME["within_ape_z"].to_numpy()
     verdict = asked.verdict(values, np.array([True, True, True, False]), within)
-    assert campaign_figures._of_time(verdict) == said
+    assert campaign_figures._describe_time_fraction(verdict) == said
 
 
 def test_mixed_requirement_averages_time_fractions_and_counts_a_missing_one_as_zero():
@@ -39,7 +39,7 @@ def test_mixed_requirement_averages_time_fractions_and_counts_a_missing_one_as_z
     beyond = campaign_summary._fraction_of_time_beyond(frame, asked, ended)
     np.testing.assert_allclose(beyond, [0.0, 0.1, 0.5, 1.0, 1.0], rtol=1e-12)
     verdict = asked.verdict(frame["ape_z"].to_numpy(), ended, frame["within_ape_z"].fill_null(np.nan).to_numpy())
-    told = campaign_summary._in_summary(verdict, asked, beyond)
+    told = campaign_summary._verdict_entry(verdict, asked, beyond)
     assert told["fraction"] == pytest.approx(told["fraction_of_time"], rel=1e-12)
     assert told["fraction"] == pytest.approx((1.0 + 0.9 + 0.5) / 5.0, rel=1e-12)
     low, high = told["fraction_interval"]
@@ -49,19 +49,21 @@ def test_mixed_requirement_averages_time_fractions_and_counts_a_missing_one_as_z
 
 
 def test_failed_trial_counts_as_zero_in_quantiles_of_a_time_fraction():
-    told = campaign_summary._of_larger_is_better(np.array([0.9, np.nan, 0.5, 0.8]), np.array([True, False, True, True]))
+    told = campaign_summary._larger_is_better_statistics(
+        np.array([0.9, np.nan, 0.5, 0.8]), np.array([True, False, True, True])
+    )
     assert (told["min"], told["max"], told["without_value"]) == (0.0, 0.9, 1)
     assert (told["0.0027"]["value"], told["0.1"]["value"], told["0.5"]["value"]) == (0.0, 0.0, 0.8)
     fractions, ended = np.linspace(0.0, 1.0, 200), np.arange(200) % 50 > 0
     told, mirrored = (
-        campaign_summary._of_larger_is_better(fractions, ended),
-        campaign_summary._of_metric(1.0 - fractions, ended),
+        campaign_summary._larger_is_better_statistics(fractions, ended),
+        campaign_summary._metric_statistics(1.0 - fractions, ended),
     )
     assert told["0.1"]["value"] == pytest.approx(1.0 - mirrored["0.9"]["value"])
     assert told["0.1"]["low"] == pytest.approx(1.0 - mirrored["0.9"]["high"])
     assert told["0.1"]["high"] == pytest.approx(1.0 - mirrored["0.9"]["low"])
     assert told["0.1"]["low"] < told["0.1"]["value"] < told["0.1"]["high"]
-    none = campaign_summary._of_larger_is_better(np.array([np.nan]), np.array([False]))
+    none = campaign_summary._larger_is_better_statistics(np.array([np.nan]), np.array([False]))
     assert none["0.5"]["value"] == 0.0
 
 

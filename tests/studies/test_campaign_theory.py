@@ -25,7 +25,7 @@ def test_bound_and_margins_use_the_first_trials_and_are_computed_once(tmp_path, 
         return []
 
     monkeypatch.setattr(runs, "rms_lower_bound", lower_bound)
-    monkeypatch.setattr(margin_verdicts, "of_trials", of_trials)
+    monkeypatch.setattr(margin_verdicts, "judge_trials", of_trials)
     table = SimpleNamespace(count=count, row=lambda k, seed: (k, seed), rows=lambda numbers, seed: np.asarray(numbers))
     simulated = SimpleNamespace(ready="ready", run_table=None if count is None else table)
     folder: Any = SimpleNamespace(path=tmp_path, seed=7, campaign=simulated, scenario=SimpleNamespace(requirements={}))
@@ -34,4 +34,4 @@ def test_bound_and_margins_use_the_first_trials_and_are_computed_once(tmp_path, 
     assert json.loads((tmp_path / "theory.json").read_text()) == {"lower_bound": 1e-6, "margins": []}
     campaign_theory.write_missing(folder)
     assert len(asked) == 2
-    assert campaign_theory.lower_bound_of(folder) == 1e-6
+    assert campaign_theory.read_lower_bound(folder) == 1e-6

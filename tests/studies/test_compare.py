@@ -25,7 +25,7 @@ from tests.output.pages import checked
 from tuning.cli import options
 from tuning.errors import UsageError
 from tuning.output import compare_report, page, summaries
-from tuning.output.formats import ratio
+from tuning.output.formats import format_ratio
 from tuning.search import custom_parts, gains
 from tuning.studies import compare, judging, tuner
 
@@ -51,7 +51,7 @@ def test_all_laws_have_the_same_mission_requirements_and_search_settings(monkeyp
         assert other.controller.t_f == base.controller.t_f
         for table in ("loop", "hardware", "dispersion", "observer", "disturbance", "spacecraft", "requirements"):
             assert getattr(other, table) == getattr(base, table)
-        for key in compare.KEPT:
+        for key in compare.SHARED_KEYS:
             assert getattr(other.tune, key) == getattr(base.tune, key)
     free = {kind: tuned(other).free for kind, other in posed.items()}
     assert free["pd"] == ("k_p", "k_d", "observer_gain")
@@ -61,7 +61,7 @@ def test_all_laws_have_the_same_mission_requirements_and_search_settings(monkeyp
 
 def test_help_of_option_against_lists_every_law():
     said = typing.get_args(options.Against)[1].help.split(": ")[1].split(";")[0]
-    assert said.split(", ") == compare.laws()[1:]
+    assert said.split(", ") == compare.law_kinds()[1:]
 
 
 def test_custom_law_is_compared_with_the_requested_laws():
@@ -107,7 +107,7 @@ def test_checksums_accept_only_the_custom_laws_of_the_comparison(tmp_path):
 
 
 def test_custom_laws_with_equal_names_get_different_labels():
-    named = compare.Rivals((), ("a.py:Mine", "b.py:Mine", "c.py:Mine", "a.py:Mine", "a.py:published")).named
+    named = compare.Rivals((), ("a.py:Mine", "b.py:Mine", "c.py:Mine", "a.py:Mine", "a.py:published")).law_tables
     assert list(named) == ["prescribed_time", "Mine", "custom Mine", "custom custom Mine", "custom published"]
     assert len({law.get("code") for law in named.values()}) == 5
 
@@ -120,7 +120,7 @@ def test_different_paths_of_one_file_are_the_same_custom_law(tmp_path, monkeypat
     base = scenario.from_tables(TABLES)
     known = [compare.identity(base, 0, compare.Rivals((), (way,))) for way in ways]
     assert known[0] == known[1] == known[2] == compare.identity(base, 0, compare.Rivals((), ways))
-    assert list(compare.Rivals((), ways).named) == ["prescribed_time", "Mine"]
+    assert list(compare.Rivals((), ways).law_tables) == ["prescribed_time", "Mine"]
 
 
 def test_baseline_law_of_the_scenario_keeps_the_bounds_of_the_scenario():
@@ -151,7 +151,7 @@ def test_model_errors_change_the_plant_but_not_the_law(eight):
     """The true inertia is 10 % larger or smaller, or the delay is one period longer. The design model is the same."""
     base = scenario.from_tables(TABLES)
     parts = scenario.study(base).parts
-    others = compare.perturbed(base)
+    others = compare.perturbed_scenarios(base)
     assert tuple(others) == compare.MODEL_ERRORS
     for name, factor in (("heavier", 1.1), ("lighter", 0.9), ("later", 1.0)):
         other = scenario.study(others[name]).parts
@@ -159,14 +159,14 @@ def test_model_errors_change_the_plant_but_not_the_law(eight):
         np.testing.assert_array_equal(other.controller.model.inertia, parts.controller.model.inertia)
         assert getattr(other.actuators, "delay", 0) == (1 if name == "later" else 0)
     twice = scenario.replace(others["heavier"], hardware__delay=1)
-    again = compare.perturbed(twice)
+    again = compare.perturbed_scenarios(twice)
     np.testing.assert_allclose(
         scenario.study(again["lighter"]).parts.plant.inertia, 0.9 * 1.1 * np.asarray(parts.plant.inertia), rtol=1e-15
     )
     assert getattr(scenario.study(again["later"]).parts.actuators, "delay", 0) == 2
     ok = rollout.OK
     lost = changed(eight, [ok] * 7 + [rollout.NOT_CONVERGED], window_error=[2.0] * 7 + [2.0], peak_torque=[0.3] * 8)
-    said = compare.figures_of(replace(contender(eight), changed={"later": lost}))["model_errors"]
+    said = compare.contender_results(replace(contender(eight), changed={"later": lost}))["model_errors"]
     assert said == {"later": {"window_error": 2.0, "window_error_interval": None,
                               "largest_peak_torque": 0.3, "failures": 1}}  # fmt: skip
 
@@ -177,7 +177,7 @@ def test_every_law_appears_in_table_page_and_figures(eight, tmp_path):
     margins = {"hold": {"stable": True, "gain_margin": 7.5, "phase_margin": 40.0, "delay_margin": None,
                         "peak_sensitivity": 3.0}}  # fmt: skip
     one = replace(contender(eight), margins=margins, changed={"heavier": eight})
-    names = ["published", *compare.laws()]
+    names = ["published", *compare.law_kinds()]
     found = compare.Comparison(dict.fromkeys(names, one), 0, False)
     (tmp_path / "out").mkdir()
     compare.write(tmp_path / "out", base, found, True, compare.identity(base, 0))
@@ -190,7 +190,7 @@ def test_every_law_appears_in_table_page_and_figures(eight, tmp_path):
         assert (row["gain_margin"], row["delay_margin"], row["window_error_later"]) == ("7.5", "", "")
         assert row["window_error_heavier"] == row["window_error"]
     laws = summaries.read(summaries.Compare, said).laws
-    answers = [(question, compare_report.table(question, laws)) for question in compare_report.QUESTIONS]
+    answers = [(question, compare_report.answer_table(question, laws)) for question in compare_report.QUESTIONS]
     read = checked(tmp_path / "out")
     # earlier, the page said that all gains of the scenario's own law were free, regardless of tune.free
     assert "tuned each law in all of its gains, the scenario's own law in those of tune.free" in read.text
@@ -199,9 +199,9 @@ def test_every_law_appears_in_table_page_and_figures(eight, tmp_path):
         assert question.title in read.text
         for series in read.charts[f"question_{k}"]["data"]:
             assert series["y"] == [row[0] for row in table.rows]
-    arcsec = [ratio(np.degrees(2 * np.arcsin(bound)) * 3600) for bound in (low, high)]
+    arcsec = [format_ratio(np.degrees(2 * np.arcsin(bound)) * 3600) for bound in (low, high)]
     assert answers[0][1].rows[3][2] == f"{arcsec[0]} to {arcsec[1]}"
-    figures = dict(compare._figures(found))
+    figures = dict(compare._plot_figures(found))
     drawn = [line for line in figures["settling"].axes[0].lines if line.get_marker() in study_plots.MARKERS]
     looks = {(line.get_color(), line.get_marker()) for line in drawn}
     assert len(drawn) == len(looks) == len(names)
@@ -209,10 +209,13 @@ def test_every_law_appears_in_table_page_and_figures(eight, tmp_path):
 
 def test_settling_times_of_small_and_large_initial_angles():
     angle, settling = np.linspace(0.3, 2.4, 100), np.concatenate([np.full(50, 30.0), np.full(50, 33.0)])
-    assert compare._near_far(angle, settling) == (30.0, 33.0)
-    assert compare._near_far(-angle, angle) == (angle[89], angle[9])  # medians of the last and the first 20 trials
-    assert compare._near_far(angle, np.where(angle > 2.2, np.inf, settling)) == (30.0, 33.0)
-    assert compare._near_far(angle, np.where(angle > 2.0, np.inf, settling)) == (30.0, None)
+    assert compare._median_settling_times(angle, settling) == (30.0, 33.0)
+    assert compare._median_settling_times(-angle, angle) == (
+        angle[89],
+        angle[9],
+    )  # medians of the last and the first 20 trials
+    assert compare._median_settling_times(angle, np.where(angle > 2.2, np.inf, settling)) == (30.0, 33.0)
+    assert compare._median_settling_times(angle, np.where(angle > 2.0, np.inf, settling)) == (30.0, None)
 
 
 def test_search_settings_and_known_bounds_are_passed_to_all_laws():
@@ -261,7 +264,7 @@ def test_statistics_of_a_contender_use_finished_trials(eight):
                      settling_time=[1.0, 2.0, 3.0, 4.0, nan, nan, nan, 0.5])  # fmt: skip
     one = contender(trials)
     assert not one.met  # one trial diverged, and one did not converge by t_f
-    found = compare.figures_of(one)
+    found = compare.contender_results(one)
     assert found["window_error"] == pytest.approx(np.sqrt((5 + 4 + 9) / 7))
     assert found["peak_torque"] == pytest.approx(10 / 7)
     assert found["largest_peak_torque"] == 3.0
@@ -269,7 +272,7 @@ def test_statistics_of_a_contender_use_finished_trials(eight):
     assert found["settling_time"] == {"0.01": 1.0, "0.5": 4.0, "0.99": None}  # quantiles of all trials, settled or not
     assert found["settling_by_angle"] is not None
     alike = np.full(8, 2.0) + 4.4e-16 * np.arange(8)  # an angle with a dispersion from 115 to 115 deg
-    alike = compare.figures_of(contender(replace(trials, drawn={**trials.drawn, "initial_angle": alike})))
+    alike = compare.contender_results(contender(replace(trials, drawn={**trials.drawn, "initial_angle": alike})))
     assert alike["settling_by_angle"] is alike["settling_near_far"] is None
     one_not_converged = contender(changed(eight, [ok] * 7 + [rollout.NOT_CONVERGED]))
     assert all(v.met for v in one_not_converged.verdicts)
@@ -280,7 +283,7 @@ def rivals(monkeypatch, eight, interrupt=None):
     """Replace search and judging by functions that record their law and seed; return the list of records."""
     asked = []
 
-    def tune(posed, seed, told, journal, *, trusted, tries):
+    def tune(posed, seed, told, journal, *, with_checks, tries):
         assert tries == 1  # more tries would judge on different trials
         law = posed.controller.kind
         asked.append(("tune", law, seed))
@@ -292,7 +295,7 @@ def rivals(monkeypatch, eight, interrupt=None):
         asked.append(("judge", "published", seed))
         return eight
 
-    monkeypatch.setattr(compare, "_with_more", lambda one, seed: one)
+    monkeypatch.setattr(compare, "_add_margins_and_model_errors", lambda one, seed: one)
     monkeypatch.setattr(tuner, "tune", tune)
     monkeypatch.setattr(judging, "judge", judge)
     return asked
@@ -301,8 +304,8 @@ def rivals(monkeypatch, eight, interrupt=None):
 def test_all_laws_are_tuned_by_one_seed_and_judged_by_another(monkeypatch, eight):
     asked = rivals(monkeypatch, eight)
     made = compare.compare(scenario.from_tables(TABLES), 5, lambda *told: None)
-    assert asked == [("judge", "published", judging.seed_of_judge(5)),
-                     *(("tune", law, 5) for law in compare.laws())]  # fmt: skip
+    assert asked == [("judge", "published", judging.derive_held_out_seed(5)),
+                     *(("tune", law, 5) for law in compare.law_kinds())]  # fmt: skip
     assert made.status == "met"
     lost = {**made.contenders, compare.OURS: contender(changed(eight, [rollout.DIVERGED] * 8))}
     assert replace(made, contenders=lost).status == "not met"
@@ -328,7 +331,7 @@ def test_scenario_that_a_law_cannot_control_is_refused_before_any_search(monkeyp
 
 
 def lines_of(summary):
-    return list(compare_report.lines(summaries.read(summaries.Compare, summary)))
+    return list(compare_report.gain_lines(summaries.read(summaries.Compare, summary)))
 
 
 def test_required_margins_appear_in_table_csv_file_and_report(eight, tmp_path):
@@ -349,7 +352,7 @@ def test_required_margins_appear_in_table_csv_file_and_report(eight, tmp_path):
     assert [row["delay_margin"] for row in rows] == ["inf", "0.2"]
     for said in (compare.summary(found), json.loads((tmp_path / "out" / "summary.json").read_text())):
         (question,) = [one for one in compare_report.QUESTIONS if "margins" in one.title]
-        table = compare_report.table(question, summaries.read(summaries.Compare, said).laws)
+        table = compare_report.answer_table(question, summaries.read(summaries.Compare, said).laws)
         assert table.head == ("", "gain [dB]", "delay [s]")
         assert table.rows == [("published gains", "5.04", "unlimited"), ("prescribed time", "-", "0.2")]
         lines = lines_of(said)

@@ -42,12 +42,12 @@ dispersion.x0 = { kind = "uniform", half_width = [0.5, 0.1] }
 def few_together():
     """Compile the margin programs for few loops: a cell has only two, at the hand-over and in the hold phase."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(linear, "TOGETHER", 4)
+        patch.setattr(linear, "PERIODS_PER_CALL", 4)
         yield
 
 
 def asked(x, y, text=SHORT):
-    return scenario.from_tables(tomllib.loads(text)), mapping.axis(x, "--x"), mapping.axis(y, "--y")
+    return scenario.from_tables(tomllib.loads(text)), mapping.parse_axis(x, "--x"), mapping.parse_axis(y, "--y")
 
 
 def simulated(x, y, text=SHORT, trials=6):
@@ -65,7 +65,10 @@ def simulated(x, y, text=SHORT, trials=6):
 )
 def test_the_default_axes_follow_the_period_and_t_f_of_the_scenario(controller, period, ends):
     made = scenario.from_tables({"controller": controller, "loop": {"mode": "sampled", "period": period}})
-    axes = mapping.axis(mapping.usual_periods(made), "--x"), mapping.axis(mapping.usual_deltas(made), "--y")
+    axes = (
+        mapping.parse_axis(mapping.default_period_axis(made), "--x"),
+        mapping.parse_axis(mapping.default_delta_axis(made), "--y"),
+    )
     assert [axis.key for axis in axes] == ["loop.period", "controller.delta"]
     assert [(axis.values[0], axis.values[-1]) for axis in axes] == ends
     assert [len(axis.values) for axis in axes] == [9, 9]
@@ -82,7 +85,7 @@ def test_the_default_axes_follow_the_period_and_t_f_of_the_scenario(controller, 
     ],
 )
 def test_axes(text, values):
-    np.testing.assert_allclose(mapping.axis(text, "--x").values, values)
+    np.testing.assert_allclose(mapping.parse_axis(text, "--x").values, values)
 
 
 @pytest.mark.parametrize(
@@ -91,20 +94,22 @@ def test_axes(text, values):
 )  # fmt: skip
 def test_axis_text_parses_to_the_same_values(text):
     """Earlier, the text was 1:6:4 for delays of 1, 2, 4 and 6 periods, but it gives other delays."""
-    once = mapping.axis(text, "--x")
-    assert mapping.axis(once.text, "--x").values == once.values
+    once = mapping.parse_axis(text, "--x")
+    assert mapping.parse_axis(once.text, "--x").values == once.values
 
 
 def test_axes_have_the_units_of_their_keys():
     loaded = scenario.from_tables(tomllib.loads(SHORT))
     shown = {"controller.delta": "[s]", "observer.gain[0]": "[N m s]", "hardware.rate_noise": "[rad/s]"}
     for key, unit in shown.items():
-        assert mapping._label(loaded, key) == f"{key} {unit}"
-    assert mapping._label(loaded, "controller.eta") == "controller.eta"
-    assert mapping._label(scenario.from_tables({}), "hardware.delay") == "hardware.delay"  # no table [hardware]
+        assert mapping._label_with_unit(loaded, key) == f"{key} {unit}"
+    assert mapping._label_with_unit(loaded, "controller.eta") == "controller.eta"
+    assert (
+        mapping._label_with_unit(scenario.from_tables({}), "hardware.delay") == "hardware.delay"
+    )  # no table [hardware]
     custom = scenario.read(ROOT / "scenarios" / "own_parts.toml")
-    assert mapping._label(custom, "controller.t_f") == "controller.t_f [s]"
-    assert mapping._label(custom, "controller.k1") == "controller.k1"  # a custom class states no unit
+    assert mapping._label_with_unit(custom, "controller.t_f") == "controller.t_f [s]"
+    assert mapping._label_with_unit(custom, "controller.k1") == "controller.k1"  # a custom class states no unit
 
 
 @pytest.mark.parametrize(
@@ -114,7 +119,7 @@ def test_axes_have_the_units_of_their_keys():
 )  # fmt: skip
 def test_invalid_axes_are_refused(text):
     with pytest.raises(UsageError, match=r"--y is .*KEY=LOW:HIGH:COUNT"):
-        mapping.axis(text, "--y")
+        mapping.parse_axis(text, "--y")
 
 
 @pytest.fixture(scope="module")
@@ -134,9 +139,11 @@ def test_cells_agree_with_separate_simulations_of_their_pair(mapped, monkeypatch
             trials = montecarlo.run(alone.parts, alone.dispersion, 3, np.arange(6))
             np.testing.assert_allclose(cell.window_error, np.sqrt(np.mean(trials.metrics.window_error**2)), rtol=1e-9)
             np.testing.assert_allclose(cell.largest_peak_torque, trials.metrics.peak_torque.max(), rtol=1e-9)
-            at, seen = run_margins.at, []
-            monkeypatch.setattr(run_margins, "at", lambda *asked, at=at, seen=seen: seen.append(at(*asked)) or seen[0])
-            ends = run_margins.at_ends(alone.parts)
+            at, seen = run_margins.margins_at, []
+            monkeypatch.setattr(
+                run_margins, "margins_at", lambda *asked, at=at, seen=seen: seen.append(at(*asked)) or seen[0]
+            )
+            ends = run_margins.margins_at_ends(alone.parts)
             for name, hold in (("hand_over", False), ("hold", True)):
                 np.testing.assert_array_equal(ends[name][0].phase, seen[0].margins.phase[seen[0].hold == hold][0])
             for name, (left, radius) in zip(("", "hold_"), ends.values(), strict=True):
@@ -180,12 +187,12 @@ def test_margins_of_a_pd_law_agree_with_the_closed_form():
 def test_gain_factor_below_one_gives_the_distance_to_the_nearest_stability_limit():
     """The input gain of the plant is 0.001 times the design model, so that the loop needs a larger gain."""
     parts = scenario.study(scenario.from_tables(tomllib.loads(CHAIN))).parts
-    loops = run_margins.at(parts, jnp.asarray([1.0])).loops
+    loops = run_margins.margins_at(parts, jnp.asarray([1.0])).loops
     weak = replace(loops, new=1e-3 * loops.new, old=1e-3 * loops.old)
     factor = float(10.0 ** (margins.compute_each(weak).gain_up[-1, 0] / 20.0))
     weak = jax.tree.map(lambda v: v[-1], weak)
-    assert factor < 1.0 < linear.radius(weak, factor)
-    assert linear.radius(weak, 0.999 / factor) > 1.0 > linear.radius(weak, 1.001 / factor)
+    assert factor < 1.0 < linear.spectral_radius(weak, factor)
+    assert linear.spectral_radius(weak, 0.999 / factor) > 1.0 > linear.spectral_radius(weak, 1.001 / factor)
 
 
 def test_value_is_set_on_all_axes_and_in_missing_keys():
@@ -221,20 +228,20 @@ def test_period_axis_needs_the_sampled_loop():
 def test_stability_limits_are_drawn_over_period_and_delta_only():
     loaded, x, y = asked("controller.delta=0.2:0.9:2", "loop.period=0.05:0.1:2")
     for clock, factor, label in (("anchored", 1.5, "3/2"), ("flight", 2.5, "1/2")):
-        lines = mapping.lines(scenario.replace(loaded, loop__clock=clock), x, y)
+        lines = mapping.stability_limit_curves(scenario.replace(loaded, loop__clock=clock), x, y)
         delta, period = lines[f"$\\delta = (\\eta - {label}) h$"]
         np.testing.assert_allclose(delta, factor * np.asarray(period))
-    lines = mapping.lines(
+    lines = mapping.stability_limit_curves(
         scenario.replace(loaded, controller__sampling="implicit"), x, y
     )  # the limit of explicit sampling for comparison
     np.testing.assert_allclose(
         lines["$\\delta = (\\eta - 1/2) h$, of explicit sampling only"][0], 2.5 * np.asarray(y.values)
     )
     delta, period = lines["with a period of delay"]
-    assert np.all(delta < mapping.lines(loaded, x, y)["the same with a period of delay"][0])
-    assert not mapping.lines(loaded, x, mapping.axis("controller.eta=3:4:2", "--y"))
+    assert np.all(delta < mapping.stability_limit_curves(loaded, x, y)["the same with a period of delay"][0])
+    assert not mapping.stability_limit_curves(loaded, x, mapping.parse_axis("controller.eta=3:4:2", "--y"))
     third = scenario.from_tables({"plant": {"kind": "chain", "order": 3}, "loop": {"mode": "sampled"}})
-    assert not mapping.lines(third, x, y)  # the formula is for plants of order 2
+    assert not mapping.stability_limit_curves(third, x, y)  # the formula is for plants of order 2
 
 
 def test_result_folder_of_a_map(mapped, tmp_path):
@@ -276,10 +283,10 @@ def test_spillover_limit_separates_stable_and_unstable_pairs(monkeypatch):
         in_hold = np.exp((frequency[0] - 6.0 + 1.6 * (law.delta - 1.5)) / 10.0)
         return {"hand_over": (none, 1.1), "hold": (none, float(in_hold))}
 
-    monkeypatch.setattr(mapping.run_margins, "at_ends", at_ends)
+    monkeypatch.setattr(mapping.run_margins, "margins_at_ends", at_ends)
     loaded, x, y, cells = simulated(*MODES)
     # all pairs are unstable at the hand-over, so that the only limit is in the hold phase
-    ((label, (across, up)),) = mapping.spillover(mapping.Map(loaded, x, y, cells)).items()
+    ((label, (across, up)),) = mapping.spillover_limit_curves(mapping.Map(loaded, x, y, cells)).items()
     assert label == "the same in hold"
     drawn = np.isfinite(across)
     np.testing.assert_allclose(across[drawn], 6.0 - 1.6 * (up[drawn] - 1.5), atol=1e-4)
@@ -290,4 +297,4 @@ def test_spillover_limit_separates_stable_and_unstable_pairs(monkeypatch):
     with pytest.raises(ScenarioError, match=r"flexible.frequency\[2\] does not exist: flexible.frequency is"):
         mapping._with_keys(loaded, {"flexible.frequency[2]": 5.0})
     rigid, *_ = asked("loop.period=0.1:0.4:3", "controller.delta=0.5:1:3")
-    assert mapping.spillover(mapping.Map(rigid, x, y, cells)) == {}
+    assert mapping.spillover_limit_curves(mapping.Map(rigid, x, y, cells)) == {}

@@ -18,7 +18,7 @@ from ptsmc_jax.simulation.metrics import Metrics
 from tests.helpers import SHORT, SHORT_CHAIN, refused, short, small_search, tree
 from tests.output.pages import checked
 from tuning.search import local_search, local_searches
-from tuning.search.evaluate import Measured
+from tuning.search.evaluate import Measurement
 from tuning.studies import front, judging, pareto, posing, trades
 
 
@@ -27,7 +27,7 @@ def test_knee_is_at_the_bend_of_the_front(scale):
     """The front is two straight lines in logarithms, first steep, then flat. The knee is their intersection."""
     torque = np.geomspace(0.1, 10.0, 21)
     error = np.where(torque < 1.0, torque**-3.0, torque**-0.2) * scale
-    assert pareto.knee_of(np.stack([torque, error], axis=1)) == 10
+    assert pareto.find_knee(np.stack([torque, error], axis=1)) == 10
 
 
 @pytest.mark.parametrize(("lost", "largest"), [(0, 90.0), (5, 90.0), (20, 80.0)])
@@ -37,7 +37,9 @@ def test_required_fraction_of_the_peak_torque_counts_failed_trials(lost, largest
     peaks, status = np.arange(1.0, 101.0), np.full(100, rollout.OK)
     status[100 - lost :] = rollout.DIVERGED
     metrics = Metrics({"peak_torque": peaks})
-    assert judging.largest("peak_torque", asked, Trials(np.arange(100), metrics, status, peaks, {})) == largest
+    assert (
+        judging.required_quantile("peak_torque", asked, Trials(np.arange(100), metrics, status, peaks, {})) == largest
+    )
 
 
 def point(peak, rms, **others):
@@ -59,7 +61,7 @@ def test_dominated_points_are_worse_by_more_than_the_interval():
     for peak, size in sizes.items():
         errors = size * common * rng.normal(1.0, 0.05, 400)
         judged.append((point(peak, float(np.sqrt(np.mean(errors**2)))), trials(errors)))
-    marked = pareto.marked(judged)
+    marked = pareto.mark_points(judged)
     assert [p.peak for p in marked] == sorted(sizes)
     # only the point with peak torque 0.4 is worse than a point with less torque by more than the interval
     assert {p.peak for p in marked if p.dominated} == {0.4}
@@ -71,7 +73,7 @@ def test_points_with_zero_or_missing_error_are_not_the_knee():
     """Their logarithms are not finite. Earlier, such a point became the knee."""
     sizes = {0.2: 4.0, 0.3: 2.0, 0.5: 1.6, 0.6: 0.0, np.nan: np.nan}
     judged = [(point(peak, size), trials([size])) for peak, size in sizes.items()]
-    assert [p.peak for p in pareto.marked(judged) if p.knee] == [0.3]
+    assert [p.peak for p in pareto.mark_points(judged) if p.knee] == [0.3]
 
 
 def test_points_with_more_failures_or_too_few_trials_do_not_dominate():
@@ -85,7 +87,7 @@ def test_points_with_more_failures_or_too_few_trials_do_not_dominate():
     worse = point(0.3, 1.0), trials(errors)
 
     def dominated(*judged):
-        return [one.peak for one in pareto.marked(judged) if one.dominated]
+        return [one.peak for one in pareto.mark_points(judged) if one.dominated]
 
     failed, failed_more = (point(0.2, 0.5, failures=1), better[1]), (point(0.3, 1.0, failures=2), worse[1])
     assert dominated(better, worse) == dominated(failed, failed_more) == [0.3]
@@ -105,7 +107,7 @@ SPACECRAFT = SHORT.replace("peak_torque = 30.0", "peak_torque = 8.0")
 def test_pareto_command_computes_a_torque_front(command, tmp_path, monkeypatch, text, limit):
     small_search(monkeypatch, 60)
     (tmp_path / "s.toml").write_text(text.replace("steps = 4", "steps = 6"))
-    refined, search, begun, searched = pareto.refined, posing.Posed.search, [], []
+    refined, search, begun, searched = pareto.refine_targets, posing.TuningSetup.search, [], []
 
     def spied(targets, known, posed, tell):
         begun.append(({one.value: one.problem for one in targets}, np.asarray(known), posed.evaluate))
@@ -115,8 +117,8 @@ def test_pareto_command_computes_a_torque_front(command, tmp_path, monkeypatch, 
         searched.append(problem.limits[problem.metrics.index("peak_torque")])
         return search(posed, problem, *args, **options)
 
-    monkeypatch.setattr(pareto, "refined", spied)
-    monkeypatch.setattr(posing.Posed, "search", searching)
+    monkeypatch.setattr(pareto, "refine_targets", spied)
+    monkeypatch.setattr(posing.TuningSetup, "search", searching)
     status, told, _ = command("pareto", "s.toml", "--points", 4, "--out", "p")
     assert set(tree(tmp_path / "p")) == {
         "front.csv", "summary.json", "scenario.toml", "versions.json", "figures/front.png"
@@ -202,7 +204,7 @@ def test_refined_target_is_not_worse_than_the_known_feasible_gains(monkeypatch, 
 
     def measured(problem, normalised):
         f = normalised[:, 0]
-        return Measured(normalised, f, np.where(f < 1.4, 0.1, -0.1)[:, None, None], f)
+        return Measurement(normalised, f, np.where(f < 1.4, 0.1, -0.1)[:, None, None], f)
 
     class Found(local_searches.LocalSearches):
         def search_locally(self, problem, starts):
@@ -216,10 +218,10 @@ def test_refined_target_is_not_worse_than_the_known_feasible_gains(monkeypatch, 
     monkeypatch.setattr(pareto, "LocalSearches", Found)
     posed: Any = SimpleNamespace(evaluate=SimpleNamespace(measure=measured), with_gradients=True)
     problem: Any = SimpleNamespace(rows=["peak_torque"])
-    step = pareto._refined(posed, problem, np.asarray([[1.0], [2.0], [4.0]]))
+    step = pareto._refine_gains(posed, problem, np.asarray([[1.0], [2.0], [4.0]]))
     assert step is not None
     assert (step.f, step.violation) == (best, 0.0)
-    assert pareto._refined(posed, problem, np.asarray([[1.0]])) is None or found is not None
+    assert pareto._refine_gains(posed, problem, np.asarray([[1.0]])) is None or found is not None
 
 
 @pytest.mark.parametrize(("least", "limits"), [(9.0, [5.0]), (2.0, [5.0, 0.25]), (1e-9, [5.0, 0.25, 0.0125])])

@@ -109,7 +109,7 @@ def test_simulate_checks_required_margins(command, tmp_path):
     assert "phase_margin at least 89 deg" in out
     said = json.loads((tmp_path / "out" / "simulate-asks" / "summary.json").read_text())["verdicts"]
     assert (said["gain_margin"]["met"], said["phase_margin"]["met"]) == (True, False)
-    _, course = stability.find(scenario.read(tmp_path / "asks.toml"))
+    _, course = stability.find_margins(scenario.read(tmp_path / "asks.toml"))
     np.testing.assert_allclose(said["phase_margin"]["worst"], course.worst()["phase_margin"], rtol=1e-9)
 
 
@@ -155,7 +155,7 @@ def test_margins_need_the_sampled_loop(command, tmp_path):
 
 def test_inputs_and_measured_signals_of_a_chain_have_names():
     loaded = scenario.from_tables({"plant": {"kind": "chain", "order": 3}, "loop": {"mode": "sampled"}})
-    assert stability.names(scenario.study(loaded)) == (["u1"], ["x1", "x2", "x3"])
+    assert stability.signal_names(scenario.study(loaded)) == (["u1"], ["x1", "x2", "x3"])
 
 
 def at_hand_over(period):
@@ -170,34 +170,34 @@ def test_diverged_nominal_run_has_nan_margins_in_maps_and_is_refused_by_margins(
     ready = at_hand_over(0.1)
     initial = jax.tree.map(lambda v: jnp.nan * v, ready.parts.initial)
     lost = dataclasses.replace(ready, parts=dataclasses.replace(ready.parts, initial=initial))
-    for left, radius in run_margins.at_ends(lost.parts).values():
+    for left, radius in run_margins.margins_at_ends(lost.parts).values():
         assert np.isnan([radius, *left.gain_up, *left.delay]).all()
     monkeypatch.setattr(stability, "study", lambda _: lost)
     with pytest.raises(
         ScenarioError, match="nominal run that reaches its end, but it ends diverged: the state, the torque"
     ):
-        stability.find(lost.scenario)
+        stability.find_margins(lost.scenario)
 
 
 def test_nominal_run_near_the_singularity_is_refused(monkeypatch):
     """Earlier, `margins` reported a stable loop."""
     ready = at_hand_over(0.1)
-    course = run_margins.along(ready.parts)
+    course = run_margins.margins_along_run(ready.parts)
     assert course.singularity_distance == 1.0  # a chain's law has no singularity
-    stability.find(ready.scenario)
-    monkeypatch.setattr(run_margins, "along", lambda _: course._replace(singularity_distance=0.9e-3))
+    stability.find_margins(ready.scenario)
+    monkeypatch.setattr(run_margins, "margins_along_run", lambda _: course._replace(singularity_distance=0.9e-3))
     with pytest.raises(ScenarioError, match="but it ends singular: the law's singularity came nearer than 1e-3"):
-        stability.find(ready.scenario)
+        stability.find_margins(ready.scenario)
 
 
 @pytest.mark.parametrize("period", short([0.1, 0.5], [0.1]))
 def test_margins_at_a_hand_over_in_the_first_period_are_those_of_the_hold_phase(period):
     """No sample before the hand-over lasts a whole period."""
     parts = at_hand_over(period).parts
-    ends = run_margins.at_ends(parts)
+    ends = run_margins.margins_at_ends(parts)
     for one, other in zip(ends["hand_over"][0], ends["hold"][0], strict=True):
         np.testing.assert_array_equal(one, other)
-    course = run_margins.along(parts)
+    course = run_margins.margins_along_run(parts)
     assert course.t.size == 1
     assert course.worst()["phase_margin"] == course.hold[1].phase.min()
     assert np.isnan(course.at_sensors.delay).all()  # delay margins are defined at the command only
@@ -217,7 +217,7 @@ def limited_to(limit):
 
 def test_saturated_command_is_reported_as_an_open_loop():
     """The loop transfer L is zero, so that the margins are infinite, whatever the gains are."""
-    ready, course = stability.find(scenario.from_tables(LIMITED))
+    ready, course = stability.find_margins(scenario.from_tables(LIMITED))
     found = stability.summary(ready, course)
     cut = [one for one in found["before"] if one["open"]]
     assert cut
@@ -230,7 +230,7 @@ def test_saturated_command_is_reported_as_an_open_loop():
     assert found["not_converged"]  # with this limit, the state 1 decreases to 0.91 in 3 s at best
     assert any(line.startswith("the nominal run has not converged at t_f") for line in report.lines)
     assert report.headline == "The nominal loop is open in the hold phase"
-    found = stability.summary(*stability.find(limited_to(50.0)))
+    found = stability.summary(*stability.find_margins(limited_to(50.0)))
     assert not any(one["open"] for one in (found, *found["before"]))
     assert "not_converged" not in found
     lines = reported(found).lines
@@ -258,7 +258,7 @@ def blamed_on_no_limit(found, first, limited):
 @pytest.mark.parametrize("limit", [50.0, 0.5])
 def test_sample_that_the_law_ignores_is_not_reported_as_saturation(limit):
     """Earlier, `margins` reported saturation."""
-    ready, course = stability.find(limited_to(limit))
+    ready, course = stability.find_margins(limited_to(limit))
     k = np.flatnonzero(course.loops.new[:-1, 0].any(axis=(1, 2)))[0]  # a sample without saturation
     nothing = {"gain_up": np.inf, "gain_down": np.inf, "phase": 180.0, "peak_sensitivity": 0.0, "crossover": np.nan}
     each = {name: getattr(course.at_input, name).copy() for name in nothing}

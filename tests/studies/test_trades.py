@@ -48,7 +48,7 @@ def test_larger_margins_reduce_the_accuracy(command, tmp_path, monkeypatch):
         errors = trials.metrics.window_error[:60]
         np.testing.assert_allclose(row["rms_window_error"], np.sqrt(np.mean(errors**2)), rtol=1e-9)
         np.testing.assert_allclose(row["peak_torque"], np.max(trials.metrics.peak_torque[:60]), rtol=1e-9)
-        by_place = stability.worst(scenario.study(judging.on_flight_clock(simulated))) or {}
+        by_place = stability.worst_margins(scenario.study(judging.on_flight_clock(simulated))) or {}
         for name in MARGINS:
             worst = max if name == "peak_sensitivity" else min
             limited = [place[name] for place in by_place.values() if place[name] is not None]
@@ -143,7 +143,7 @@ def test_faster_slew_needs_more_torque_and_is_less_accurate(command, tmp_path, m
         errors = []
         for found in (found_here, other):  # the fixed gains are those of t_f = 5 s
             known = gains.in_scenario(untuned, {"t_f": found_here["t_f"], "eta": found["eta"], "delta": found["delta"]})
-            trials = judging.judge(known, judging.seed_of_judge(0))
+            trials = judging.judge(known, judging.derive_held_out_seed(0))
             errors.append(np.sqrt(np.mean(trials.metrics.window_error[:60] ** 2)))
         np.testing.assert_allclose(found_here["rms_window_error"], errors[0], rtol=1e-9)
         assert errors[0] < errors[1]
@@ -164,7 +164,7 @@ def test_faster_slew_needs_more_torque_and_is_less_accurate(command, tmp_path, m
 def test_every_prescribed_time_has_its_own_search(monkeypatch):
     """Other times may have other local minima. All times use the difficult trials of the first two times."""
     small_search(monkeypatch, 8)
-    searched, simulated, joined, search = [], [], [], posing.Posed.search
+    searched, simulated, joined, search = [], [], [], posing.TuningSetup.search
 
     def note(posed, problem, scenario_gains, starts, *asked, **told):
         searched.append((float(problem.parts.controller.t_f), starts > 1))
@@ -173,7 +173,7 @@ def test_every_prescribed_time_has_its_own_search(monkeypatch):
         joined.append(np.asarray(outcome.problem.trials).tolist())
         return outcome
 
-    monkeypatch.setattr(posing.Posed, "search", note)
+    monkeypatch.setattr(posing.TuningSetup, "search", note)
     usual = SHORT_CHAIN.replace(", delta = [0.1, 2.0]", "")  # default bounds, up to 2.55 s for t_f = 5 s
     pareto.trace(trades.SlewTime(scenario.from_tables(tomllib.loads(usual)), (3.9, 4.5, 5.0)), 0)
     assert searched == [(5.0, True), (3.9, True), (4.5, True)]

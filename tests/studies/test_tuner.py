@@ -25,7 +25,7 @@ LIMIT = 0.6  # on the peak torque
 @pytest.mark.parametrize("seed", [0, 1000, 654735429, 2933870671, 188629158])
 def test_seeds_of_held_out_trials_differ_from_each_other_and_from_the_search(seed):
     """The hash maps one seed to itself, and another one in each later turn. The parameters include these seeds."""
-    seeds = [seed, *(judging.seed_of_judge(seed, turn) for turn in range(tuner.TRIES))]
+    seeds = [seed, *(judging.derive_held_out_seed(seed, turn) for turn in range(tuner.TRIES))]
     assert len(set(seeds)) == len(seeds)
     plain = [draws.derive(seed, name) for name in ("fresh trials", "fresh trials 1", "fresh trials 2")]
     assert (seeds[1:] == plain) == (seed not in plain)
@@ -36,19 +36,25 @@ def small(monkeypatch):
     """Search with few trials and judge on enough trials to break a limit, by the compiled programs of test_cli.py."""
     small_search(monkeypatch, 60)
     monkeypatch.setattr(worst, "SCREENED", 2)
-    monkeypatch.setattr(tuner, "_prepare", lambda _: None)  # it compiles the margins, which the tests do not use
-    monkeypatch.setattr(tuner, "_shortest", lambda *_: None)  # it needs another compiled program
+    monkeypatch.setattr(
+        tuner, "_compile_judging", lambda _: None
+    )  # it compiles the margins, which the tests do not use
+    monkeypatch.setattr(tuner, "_find_shortest_time", lambda *_: None)  # it needs another compiled program
 
 
 def test_search_is_repeated_if_held_out_trials_break_a_limit(small):
     """The largest torque of two training and two screened trials is smaller than that of 60 held-out trials."""
     text = SHORT_CHAIN.replace("peak_torque = 3.0", f"peak_torque = {LIMIT}").replace("trials = 8", "trials = 2")
     loaded = scenario.from_tables(tomllib.loads(text))
-    found = tuner.tune(loaded, 0, trusted=False)
+    found = tuner.tune(loaded, 0, with_checks=False)
     first, second = found.earlier
     assert found.met
     seeds = [one.held_out_seed for one in (first, second, found)]
-    assert seeds == [judging.seed_of_judge(0), judging.seed_of_judge(0, 1), judging.seed_of_judge(0, 2)]
+    assert seeds == [
+        judging.derive_held_out_seed(0),
+        judging.derive_held_out_seed(0, 1),
+        judging.derive_held_out_seed(0, 2),
+    ]
     assert len(set(seeds)) == 3
 
     def peak(gains, seed):
@@ -68,14 +74,14 @@ def test_search_is_repeated_if_held_out_trials_break_a_limit(small):
     for one, start in zip((first, second), (2, 4), strict=True):
         np.testing.assert_allclose(goes_on[start], [*one.gains.values()], rtol=1e-9)  # rounded to ten digits
     assert [step.start for step in found.search.history] == sorted(step.start for step in found.search.history)
-    lines = tune_report.search(summaries.tune(tune_files.summary(found)))
+    lines = tune_report.search_lines(summaries.tune(tune_files.summary(found)))
     told = [one for one in lines if one.startswith("earlier gains")]
     assert margins[0] == 0.03
     for one, before, after, sentence in zip((first, second), margins, margins[1:], told, strict=False):
         assert f"reached {one.over['peak_torque']:.4g} times the limit of peak_torque on held-out trials" in sentence
         assert f"{100 * after:.2g} % instead of {100 * before:.2g} %" in sentence
     assert len(told) == 2
-    once = tuner.tune(loaded, 0, trusted=False, tries=1)
+    once = tuner.tune(loaded, 0, with_checks=False, tries=1)
     assert once.gains == first.gains
     assert not once.met
 
@@ -86,7 +92,7 @@ def test_tuning_of_delta_or_t_f_uses_the_anchored_clock(free, anchored):
     bounds = {"eta": [2.6, 3.1], "delta": [0.1, 2.0], "t_f": [4.0, 6.0]}
     tables = tomllib.loads(SHORT_CHAIN) | {"tune": {"free": free, "bounds": {name: bounds[name] for name in free}}}
     simulated = scenario.replace(scenario.from_tables(tables), loop__clock="flight")
-    posed = posing.tuning_problem(simulated, 0)
+    posed = posing.set_up_tuning(simulated, 0)
     assert posed.problem.parts.clock.anchored is anchored
     assert posed.ready.scenario == (scenario.from_tables(tables) if anchored else simulated)
 
@@ -96,12 +102,12 @@ def test_reach_covers_the_bounds_and_the_own_values_of_the_gains():
     wide = {"eta": [2.1, 9.0], "delta": [0.1, 4.0], "t_f": [20.0, 60.0], "observer_gain": [2.0, 50.0],
             "k1": [0.5, 7.0], "sign_width": [1e-4, 1e-2], "surface_rate": [0.2, 3.0]}  # fmt: skip
     made = scenario.from_tables({"controller": {"sign_width": 1e-3}, "tune": {"free": [*wide], "bounds": wide}})
-    reach = posing.reach(made, made.search)
+    reach = posing.tuning_reach(made, made.search)
     assert (reach.smallest_t_f, reach.t_f) == (20.0, 60.0)
     assert (reach.smallest_delta, reach.delta) == (0.05, 4.0)  # the scenario's own is shorter
     assert (reach.gain, reach.largest_gain) == (2.0, 50.0)
     assert (reach.k1, reach.sign_width, reach.surface_rate) == (7.0, 1e-4, 3.0)
-    assert posing.reach(made, made.search, t_f=99.0).t_f == 99.0
+    assert posing.tuning_reach(made, made.search, t_f=99.0).t_f == 99.0
 
 
 def test_single_nominal_trial_is_judged_without_the_quantile():
@@ -137,7 +143,7 @@ def test_influence_of_a_gain_is_unknown_if_no_trial_finishes(objective, said):
     profile = trust.Profile(np.arange(3.0), np.full(3, objective), np.ones(3), np.zeros(3))
     found: Any = SimpleNamespace(gradient_error=None, profiles={"eta": profile}, sensitivities={}, margins={})
     tuning: Any = SimpleNamespace(tuned=SimpleNamespace(sampled=True, hardware=None), at_bound={"eta": "upper"})
-    assert tune_files._trust(found, tuning)["influence"] == {"eta": said}
+    assert tune_files._trust_entry(found, tuning)["influence"] == {"eta": said}
 
 
 @pytest.mark.parametrize(
@@ -201,25 +207,25 @@ def test_search_widens_default_bounds_of_gains_that_matter(monkeypatch):
     """The bound of K1 is multiplied by ten, at most three times. The bound of eta stays, because eta has no effect."""
     tables = {"controller": {"t_f": 30.0}, "tune": {"free": ["eta", "k1"]}}
     searched = list[dict[str, tuple[float, float]]]()
-    monkeypatch.setattr(posing, "tuning_problem", lambda made, *_, **__: Rising(made, searched))
-    monkeypatch.setattr(tuner, "_renumbered", lambda before, more: more)
+    monkeypatch.setattr(posing, "set_up_tuning", lambda made, *_, **__: Rising(made, searched))
+    monkeypatch.setattr(tuner, "_renumber_starts", lambda before, more: more)
     some, told = scenario.from_tables(tables), []
     first, usual = Rising(some, searched), some.search.bounds
     outcome = first.search(None, None, 1, None)
-    found, posed = tuner._in_larger_bounds(
+    found, posed = tuner._search_in_wider_bounds(
         cast(Any, outcome), cast(Any, first), None, lambda *said: told.append(said[0])
     )
     factors = [one["k1"][1] / usual["k1"][1] for one in searched]
-    np.testing.assert_allclose(factors, 10.0 ** np.arange(1 + tuner.WIDENED), rtol=1e-12)
+    np.testing.assert_allclose(factors, 10.0 ** np.arange(1 + tuner.MOST_WIDENINGS), rtol=1e-12)
     assert all(one["eta"] == usual["eta"] for one in searched)
-    assert told == ["searching beyond the bounds of k1"] * tuner.WIDENED
+    assert told == ["searching beyond the bounds of k1"] * tuner.MOST_WIDENINGS
     assert found.gains[1] == pytest.approx(1e3 * usual["k1"][1])
-    assert len(found.history) == 1 + tuner.WIDENED
-    assert posed.evaluate.rollouts == 10 * (1 + tuner.WIDENED)
+    assert len(found.history) == 1 + tuner.MOST_WIDENINGS
+    assert posed.evaluate.rollouts == 10 * (1 + tuner.MOST_WIDENINGS)
     assert posed.ready.scenario.search.bounds == searched[-1]
     stated = scenario.replace(some, tune__bounds={"k1": usual["k1"]})  # explicit bounds do not change
     first = Rising(stated, searched)
-    assert tuner._in_larger_bounds(cast(Any, outcome), cast(Any, first), None, lambda *_: None)[1] is first
+    assert tuner._search_in_wider_bounds(cast(Any, outcome), cast(Any, first), None, lambda *_: None)[1] is first
 
 
 @pytest.mark.parametrize(
@@ -242,9 +248,9 @@ def test_violations_that_a_repeated_search_cannot_fix_are_ignored(metric, values
 def test_default_gain_equals_its_explicit_value():
     """The scenario omits the bandwidth of the filter. Its default equals the published gain."""
     loaded = scenario.read(ROOT / "scenarios" / "filtered_flight.toml")
-    assert list(judging.beside(loaded)[0]) == ["published"]
+    assert list(judging.reference_scenarios(loaded)[0]) == ["published"]
     other = scenario.replace(loaded, controller__eta=4.0)
-    assert list(judging.beside(other)[0]) == ["published", "before"]
+    assert list(judging.reference_scenarios(other)[0]) == ["published", "before"]
 
 
 def test_requirements_broken_by_more_accurate_gains_are_listed(monkeypatch):
@@ -261,7 +267,7 @@ def test_requirements_broken_by_more_accurate_gains_are_listed(monkeypatch):
 
     def broken_by(published, before):
         held_out: Any = {"tuned": tuned, "published": published, "before": before}
-        return tuner._broken_by(cast(Any, names), held_out, 0)
+        return tuner._find_broken_requirements(cast(Any, names), held_out, 0)
 
     assert broken_by(simulated([1.0, 2.0]), simulated([1.0, 1.0])) == {"published": ["gain_margin"], "before": []}
     assert broken_by(simulated([3.0, 2.0]), simulated([2.0, 2.0])) == {}

@@ -109,7 +109,7 @@ def radius_late(loop, axis, late):
     (a, command), whole = loop.closed_at_sensors(np), int(late)
     (m, n), pushes = command.shape, np.zeros((whole + 2, *command.T.shape))
     pushes[0] = loop.new[0] * (np.arange(m) != axis)
-    for push, acts in zip(pushes[whole:], linear.acting(loop, late - whole, np), strict=True):
+    for push, acts in zip(pushes[whole:], linear.command_effect(loop, late - whole, np), strict=True):
         push[:, axis] += acts[:, axis]
     closed = np.eye(n + (whole + 1) * m, k=-m)
     closed[:n], closed[n : n + m] = np.hstack([a + pushes[0] @ command, *pushes[1:]]), 0.0

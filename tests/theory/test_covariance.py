@@ -73,7 +73,7 @@ def test_covariance_predicts_the_error_of_simulated_trials(case, trials, start):
         rms.append(float(np.sqrt(np.mean(simulated.metrics.window_error**2))))
     share = np.sqrt(rms[0] ** 2 - rms[1] ** 2)
     assert share > 0.4 * rms[0]  # noise is a large part of the error
-    np.testing.assert_allclose(covariance.noise(scenario.study(noisy).parts).window_error, share, rtol=0.1)
+    np.testing.assert_allclose(covariance.propagate_noise(scenario.study(noisy).parts).window_error, share, rtol=0.1)
 
 
 def simulated_chain(**changes):
@@ -104,7 +104,7 @@ def test_noise_reports_whether_the_statistical_linearisation_converged(monkeypat
         "hardware": {"state_noise": [1e-3, 1e-3]},
     }
     monkeypatch.setattr(covariance, "ROUNDS", rounds)
-    assert covariance.noise(scenario.study(scenario.from_tables(tables)).parts).converged is converged
+    assert covariance.propagate_noise(scenario.study(scenario.from_tables(tables)).parts).converged is converged
 
 
 def test_window_error_includes_the_error_between_samples():
@@ -116,7 +116,7 @@ def test_window_error_includes_the_error_between_samples():
         loop={"period": 0.5, "t_end": 18.0, "window": 0.6},
         hardware={"state_noise": [2e-5, 1e-6]},
     )
-    np.testing.assert_allclose(covariance.noise(parts).window_error, simulated, rtol=0.05)
+    np.testing.assert_allclose(covariance.propagate_noise(parts).window_error, simulated, rtol=0.05)
 
 
 def test_a_random_walk_acts_from_the_start_of_its_period():
@@ -128,26 +128,26 @@ def test_a_random_walk_acts_from_the_start_of_its_period():
         loop={"period": 1.0, "t_end": 5.0},
         hardware={"state_noise": [1e-12, 1e-12]},
     )
-    np.testing.assert_allclose(covariance.noise(parts).window_error, simulated, rtol=0.04)
+    np.testing.assert_allclose(covariance.propagate_noise(parts).window_error, simulated, rtol=0.04)
 
 
 def test_filter_covariance_stays_at_its_initial_steady_state():
     """It covers attitude and bias for six time constants. Averaged loops change the covariance by about a tenth."""
     parts = scenario.study(scenario.from_tables(ALL_AT_ONCE)).parts
-    run, periods = linear.nominal_jit(parts), np.arange(linear.TOGETHER)
-    opened = linear.opened_in(parts, run, periods)
+    run, periods = linear.simulate_nominal_jit(parts), np.arange(linear.PERIODS_PER_CALL)
+    opened = linear.linearise_periods(parts, run, periods)
     ticks = jax.tree.map(lambda v: np.asarray(v)[periods], run.period.now)
-    state = covariance._State(parts, ticks, opened)
-    _, moved = state.moved(opened.loop)
+    state = covariance._StateSpace(parts, ticks, opened)
+    _, moved = state.transition_maps(opened.loop)
     first = state.memory
     known = np.eye(state.size)[first : first + 6]  # the filter's attitude and bias
     known[:3, :3] -= np.eye(3)
-    known[3:, state._own] -= np.eye(3)
+    known[3:, state._sensor_states] -= np.eye(3)
     p = state.start()
     begun, sizes = np.sqrt(np.diag(known @ p @ known.T)), []
-    np.testing.assert_allclose(np.sqrt(np.diag(p)[state._own]), 1e-5, rtol=1e-12)
+    np.testing.assert_allclose(np.sqrt(np.diag(p)[state._sensor_states]), 1e-5, rtol=1e-12)
     for j, length in enumerate(ticks.t_next - ticks.t):
-        p = moved.at(j).covariance(p) + np.diag((state.drift * length) ** 2)
+        p = moved.in_period(j).covariance(p) + np.diag((state.drift * length) ** 2)
         sizes.append(np.sqrt(np.diag(known @ p @ known.T)))
     np.testing.assert_allclose(np.asarray(sizes) / begun, 1.0, atol=0.15)
 
@@ -160,9 +160,9 @@ def test_propagated_state_has_the_dynamics_of_the_closed_loop(delay):
     a, seen, push, command, direct, pushed = (jnp.asarray(rng.normal(size=(1, *shape))) for shape in shapes)
     loop = linear.Loop(a, seen, push, 0.0 * push, command, direct, pushed, jnp.ones(1), delay)
     opened: Any = SimpleNamespace(loop=jax.tree.map(np.asarray, loop), error=np.zeros((1, m, 5)))
-    state = covariance._State(a_body(period=0.1), Ticks(*[jnp.zeros(1)] * 6), opened)
-    commanded, moved = state.moved(opened.loop)
-    at_input = linear.at_input(jax.tree.map(lambda v: v[0], opened.loop), xp=np)
+    state = covariance._StateSpace(a_body(period=0.1), Ticks(*[jnp.zeros(1)] * 6), opened)
+    commanded, moved = state.transition_maps(opened.loop)
+    at_input = linear.open_at_input(jax.tree.map(lambda v: v[0], opened.loop), xp=np)
     closed, size = at_input.closed(), n + delay * m
     expected = np.block([[closed, np.eye(size, n) @ opened.loop.disturbed[0]], [np.zeros((m, size)), np.eye(m)]])
     np.testing.assert_allclose(moved.state[0], expected, rtol=0.0, atol=1e-14 * np.abs(closed).max())
@@ -172,9 +172,9 @@ def test_propagated_state_has_the_dynamics_of_the_closed_loop(delay):
 def test_noise_does_not_apply_to_implicit_sampling():
     """For noise beyond the reach of the switching term the predicted torque would be 13 times too large."""
     parts = scenario.study(scenario.from_tables({"loop": {"mode": "sampled"}, "hardware": {"rate_noise": 1e-6}})).parts
-    assert covariance.predicts(parts)
-    assert not covariance.predicts(replace(parts, controller=replace(parts.controller, implicit=True)))
-    assert not covariance.predicts(replace(parts, sensors=PerfectSensors()))
+    assert covariance.is_applicable(parts)
+    assert not covariance.is_applicable(replace(parts, controller=replace(parts.controller, implicit=True)))
+    assert not covariance.is_applicable(replace(parts, sensors=PerfectSensors()))
 
 
 @pytest.mark.parametrize("width", [1e-4, 0.02, 0.1, 0.3, 2.0, 30.0])
@@ -184,9 +184,9 @@ def test_equivalent_width_matches_numerical_integration(width):
     n = np.linspace(-reach, reach, 2 * round(reach / step) + 1)
     slope = np.trapezoid(np.exp(-(n**2) / 2.0) / np.cosh(n / width) ** 2, n) / np.sqrt(2.0 * np.pi) / width
     for sigma in (1.0, 2e-6):
-        np.testing.assert_allclose(covariance._mean_width(width * sigma, sigma), sigma / slope, rtol=1e-10)
-    assert covariance._mean_width(width, 0.0) == width
-    assert covariance._mean_width(0.0, 1.0) == pytest.approx(np.sqrt(np.pi / 2.0), rel=1e-12)
+        np.testing.assert_allclose(covariance._equivalent_width(width * sigma, sigma), sigma / slope, rtol=1e-10)
+    assert covariance._equivalent_width(width, 0.0) == width
+    assert covariance._equivalent_width(0.0, 1.0) == pytest.approx(np.sqrt(np.pi / 2.0), rel=1e-12)
 
 
 def test_equivalent_width_follows_the_noise_of_each_period():
@@ -205,7 +205,7 @@ def test_equivalent_width_follows_the_noise_of_each_period():
     }
     parts = scenario.study(scenario.from_tables(tables)).parts
     fly = jax.jit(jax.vmap(lambda k: rollout.simulate(parts, np.uint32(0), k, record=True)))
-    simulated, expected = fly(np.arange(200, dtype=np.uint32)), covariance.noise(parts)
+    simulated, expected = fly(np.arange(200, dtype=np.uint32)), covariance.propagate_noise(parts)
     command, s, t = (np.asarray(v) for v in (simulated.log.commanded, simulated.log.s, simulated.log.t))
     np.testing.assert_allclose(expected.torque, command.std(axis=0).max(), rtol=0.2)
     np.testing.assert_allclose(expected.s, np.sqrt(np.mean(s[:, t[0] >= 6.0].var(axis=0))), rtol=0.1)
@@ -217,4 +217,4 @@ def test_noise_that_stabilises_a_narrow_sign_is_predicted():
     """The window error of 100 simulated trials is 3.3e-6, including the noise-free error of the narrow sign."""
     given = {**QUIET, **CASES[SHORT[0]], "controller__sign_width": 1e-7, "controller__disturbance_rate_bound": 1e-3}
     parts = scenario.study(scenario.replace(scenario.read(FIRST_FLIGHT), tune=None, **given)).parts
-    assert covariance.noise(parts).window_error == pytest.approx(3.3e-6, rel=0.2)
+    assert covariance.propagate_noise(parts).window_error == pytest.approx(3.3e-6, rel=0.2)

@@ -45,7 +45,7 @@ def exact(run, t):
         moved = jax.vmap(lambda time: hold.exact_hold(time, law.surface(), law.reaching_rate, at))(t - law.hand_over)
         return moved.x[:, 0], moved.s, moved.acceleration
 
-    return jax.vmap(component, out_axes=1)(solutions.starts(run))
+    return jax.vmap(component, out_axes=1)(solutions.initial_errors(run))
 
 
 LAWS = {

@@ -43,7 +43,7 @@ def test_size_of_a_slow_limit_cycle_is_peak_to_peak(delay):
     """The command changes between two samples by much less than from peak to peak."""
     delayed = {"controller__sign_width": 1e-7, "hardware__delay": delay}
     parts = scenario.study(scenario.replace(scenario.from_tables(CHAIN), **delayed)).parts
-    seen = limit_cycles.history(parts, linear.nominal_jit(parts))
+    seen = limit_cycles.command_history(parts, linear.simulate_nominal_jit(parts))
     found = limit_cycles.find(parts, seen)
     assert found is not None
     assert found.periods > 4 * delay
@@ -72,7 +72,7 @@ def test_no_limit_cycle_for_a_discontinuous_sign_or_a_short_hold_phase():
 def test_limit_cycle_detection_needs_sixteen_full_periods(whole, judged):
     """The run has a limit cycle throughout. The test marks only the last periods as hold phase."""
     parts = scenario.study(scenario.replace(scenario.from_tables(CHAIN), controller__sign_width=1e-7)).parts
-    seen = limit_cycles.history(parts, linear.nominal_jit(parts))
+    seen = limit_cycles.command_history(parts, linear.simulate_nominal_jit(parts))
     in_hold = np.flatnonzero(seen.in_hold)
     told = np.isin(np.arange(len(seen.in_hold)), in_hold[-whole:])
     assert (limit_cycles.find(parts, seen._replace(in_hold=told)) is not None) == judged
@@ -81,7 +81,7 @@ def test_limit_cycle_detection_needs_sixteen_full_periods(whole, judged):
 def test_without_margins_sets_positive_margins_to_zero_and_keeps_negative_ones():
     stable = np.array([[True], [True], [False]])
     values: Any = {name: np.array([[3.0], [3.0], [-3.0]]) for name in margins.Margins._fields} | {"stable": stable}
-    left = limit_cycles.without_margins(margins.Margins(**values), [False, True, True])
+    left = limit_cycles.zero_margins(margins.Margins(**values), [False, True, True])
     for name, of in left._asdict().items():
         none = {"peak_sensitivity": 100.0, "stable": False, "crossover": np.nan}.get(
             name, 0.0
@@ -113,7 +113,7 @@ def test_limit_cycle_of_a_law_without_sign_width_is_detected(monkeypatch):
     turning = np.where(np.arange(40) % 2, 0.5, -0.5)[:, None]
     law: Any = SimpleNamespace(controller=SimpleNamespace())
     run = SimpleNamespace(command=turning)
-    monkeypatch.setattr(linear, "nominal_jit", lambda _: run)
+    monkeypatch.setattr(linear, "simulate_nominal_jit", lambda _: run)
     seen = limit_cycles.History(jnp.asarray(turning), jnp.ones(40, bool))
     for left, found in ((0.9, limit_cycles.LimitCycle(1.0, 2.0)), (0.0, None)):
         monkeypatch.setattr(limit_cycles, "_nonlinear_residual", lambda *_, left=left: (left * turning, turning))

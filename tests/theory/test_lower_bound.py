@@ -36,7 +36,7 @@ def still(made):
 
 def simulated_at(made, **changes):
     """The parts with the flight clock and changed devices."""
-    return dataclasses.replace(made, clock=clock.flight(PERIOD, float(made.t_end)), **changes)
+    return dataclasses.replace(made, clock=clock.flight_clock(PERIOD, float(made.t_end)), **changes)
 
 
 def delayed(periods):
@@ -120,7 +120,7 @@ def test_lower_bound_of_a_chain_equals_least_squares(order, delay):
     made = chain_parts([0.5, -0.2, 0.1][:order], t_f=2.0, period=PERIOD, noise=[1e-3, 5e-2, 2e-4][:order])
     density = 3e-3
     made = simulated_at(made, walk_rate=vector([density]), actuators=delayed(delay))
-    found = lower_bound.along(made, still(made))
+    found = lower_bound.bound_along_run(made, still(made))
     periods, n = len(found.t), order
 
     def motion(t):
@@ -147,7 +147,7 @@ def test_lower_bound_uses_the_actual_sample_times():
     late = 0.4 * PERIOD * np.sin(7.0 * np.arange(len(log.t)))
     late[[0, -1]] = 0.0
     log = log._replace(t=log.t + late)
-    found = lower_bound.along(made, log)
+    found = lower_bound.bound_along_run(made, log)
     np.testing.assert_allclose(found.t, log.t[1:], rtol=1e-15)
     for k, wanted in enumerate(found.error):
         since = log.t[: k + 1] - log.t[k + 1]
@@ -190,7 +190,7 @@ def test_lower_bound_of_a_spacecraft_at_rest_equals_least_squares(kind):
     first = 0
     if kind == "later":
         made, first = dataclasses.replace(made, clock=parts(**AT_REST, delta=2 * PERIOD).clock), -22
-    found = lower_bound.along(made, still(made))
+    found = lower_bound.bound_along_run(made, still(made))
     periods = len(found.t)
     squares = np.zeros((periods, 3))
     numbers = first + np.arange(periods)
@@ -227,22 +227,22 @@ def test_along_each_equals_separate_calls():
 
     runs = [chain(), chain(noise=(2e-3, 1e-2)), chain(delay=2), chain(t_f=2.2), chain(noise=None), chain(delay=2)]
     simulated = [(made, still(made)) for made in runs]
-    for (made, log), found in zip(simulated, lower_bound.along_each(simulated), strict=True):
-        alone = lower_bound.along(made, log)
+    for (made, log), found in zip(simulated, lower_bound.bounds_along_runs(simulated), strict=True):
+        alone = lower_bound.bound_along_run(made, log)
         # QR of the same matrices, batched or one after the other
         np.testing.assert_allclose(found.error, alone.error, rtol=1e-13)
         np.testing.assert_allclose(found.window_error, alone.window_error, rtol=1e-13)
         np.testing.assert_array_equal(found.t, alone.t)
-    lower_bounds = [found.window_error for found in lower_bound.along_each(simulated)]
+    lower_bounds = [found.window_error for found in lower_bound.bounds_along_runs(simulated)]
     assert len(set(lower_bounds)) == 5  # two of the six runs are equal
     assert lower_bounds[4] == 0.0
-    assert lower_bound.along_each([]) == []
+    assert lower_bound.bounds_along_runs([]) == []
 
 
 def test_a_state_measured_without_noise_is_known():
     """The rate is known to be zero, so that the best estimate of the position is the mean of all samples."""
     made = simulated_at(chain_parts([1.0, 0.0], t_f=2.0, period=PERIOD, noise=[1e-3, 0.0]))
-    found = lower_bound.along(made, still(made))
+    found = lower_bound.bound_along_run(made, still(made))
     np.testing.assert_allclose(found.error, 1e-3 / np.sqrt(1.0 + np.arange(len(found.t))), rtol=1e-9)
 
 
@@ -250,7 +250,7 @@ def test_without_noise_only_the_random_walk_is_unknown():
     """All states are measured exactly. Only the effect of the walk's step within a period remains."""
     density = 0.2
     made = simulated_at(chain_parts([1.0, 0.0], t_f=2.0, period=PERIOD), walk_rate=vector([density]))
-    found = lower_bound.along(made, still(made))
+    found = lower_bound.bound_along_run(made, still(made))
     np.testing.assert_allclose(found.error, density * PERIOD * PERIOD**2 / 2, rtol=1e-6)  # EXACT, over one period
 
 
@@ -258,7 +258,7 @@ def test_without_noise_only_the_random_walk_is_unknown():
 def test_lower_bound_is_zero_if_exact_positions_determine_the_rate(delay):
     """It is zero from the second sample on for any noise of the rate. Rounding of 1e-14 must not appear as a bound."""
     made = simulated_at(chain_parts([1.0, 0.0], t_f=2.0, period=PERIOD, noise=[0.0, 1e-3]), actuators=delayed(delay))
-    found = lower_bound.along(made, still(made))
+    found = lower_bound.bound_along_run(made, still(made))
     np.testing.assert_allclose(found.error[delay], (1 + delay) * PERIOD * 1e-3, rtol=1e-9)  # by its only sample
     np.testing.assert_array_equal(found.error[delay + 1 :], 0.0)
     assert found.window_error == 0.0
@@ -266,10 +266,10 @@ def test_lower_bound_is_zero_if_exact_positions_determine_the_rate(delay):
 
 def test_lower_bound_is_zero_without_noise():
     continuous = parts(t_f=3.0)
-    assert lower_bound.along(continuous, still(continuous)).window_error == 0.0
+    assert lower_bound.bound_along_run(continuous, still(continuous)).window_error == 0.0
     for noise in (None, [0.0, 0.0]):
         made = simulated_at(chain_parts([1.0, 0.0], t_f=2.0, period=PERIOD, noise=noise))
-        found = lower_bound.along(made, still(made))
+        found = lower_bound.bound_along_run(made, still(made))
         assert found.window_error == 0.0
         np.testing.assert_array_equal(found.error, 0.0)
 
@@ -280,11 +280,11 @@ def test_wheel_momentum_couples_the_axes():
     device = reaction_wheels.wheels(np.eye(3), momentum)
     calm = parts(**AT_REST, noise=(2e-5, 1e-6), disturbance=disturbances.Constant(jnp.zeros(3)))
     made = simulated_at(calm, actuators=actuators.Actuators(wheels=device))
-    ticks, log = lower_bound._lasting(made, still(made))
-    linear = lower_bound._linear(made, log, ticks)
+    ticks, log = lower_bound._nonzero_periods(made, still(made))
+    linear = lower_bound._linearise_run(made, log, ticks)
     coupled = np.asarray(made.plant.inertia_inverse) @ np.cross(momentum, np.eye(3)).T
     # the error of RK4 is 0.04^5 / 120 for 0.3 rad/s over a period
-    np.testing.assert_allclose(linear.move[0][3:, 3:], expm(coupled * PERIOD), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(linear.transition[0][3:, 3:], expm(coupled * PERIOD), rtol=0, atol=1e-9)
 
 
 def test_a_filter_with_kalman_gains_attains_the_lower_bound():
@@ -309,8 +309,8 @@ def test_a_filter_with_kalman_gains_attains_the_lower_bound():
     sensor = sensors.Sensors(vector(star), vector(gyro), vector(1e-3), vector(drift), held, every)
     made = parts(**{**AT_REST, "t_end": 40.0})
     made = simulated_at(made, sensors=sensor, walk_rate=vector([1e3] * 3))
-    ticks, log = lower_bound._lasting(made, still(made))
-    at_start = lower_bound.deviations(lower_bound._model(made, log, ticks))[:, :3]
+    ticks, log = lower_bound._nonzero_periods(made, still(made))
+    at_start = lower_bound.deviations(lower_bound._build_model(made, log, ticks))[:, :3]
     after_star = at_start[::every]
     assert len(after_star) > 50
     # the error is half an angle

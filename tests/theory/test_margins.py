@@ -13,7 +13,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.batching import lapack
 from ptsmc_jax.plants import second_order
 from ptsmc_jax.theory import crossings, limit_cycles, linear, margins, run_margins, stability_limits
-from ptsmc_jax.theory.carries import Local
+from ptsmc_jax.theory.carries import LocalCoordinates
 from tests.helpers import equations, fly, short
 from tests.helpers import parts as a_body
 from tests.theory.loops import (
@@ -48,13 +48,13 @@ def chain(**changes):
 
 
 def opened(parts, hold=True):
-    run = linear.nominal_jit(parts)
+    run = linear.simulate_nominal_jit(parts)
     for side in (True, False):
         periods = linear.full_periods(parts, run, hold=side)
         assert periods.size > 0
         assert np.all(np.asarray(run.period.now.hold)[periods] == side)
     index = linear.full_periods(parts, run, hold=hold)[-1:]
-    return jax.tree.map(lambda v: v[0], linear.loops_in(parts, run, index))
+    return jax.tree.map(lambda v: v[0], linear.open_loops(parts, run, index))
 
 
 @pytest.mark.parametrize("m", [1, 3, 4])
@@ -66,7 +66,7 @@ def test_one_axis_loop_equals_a_ratio_of_determinants(m):
         [np.linalg.det(r) / np.linalg.det(np.delete(np.delete(r, k, 0), k, 1)) - 1.0 for k in range(m)] for r in rest
     ]
     # rounding errors of m eliminations, whose pivots are at least 0.15
-    np.testing.assert_allclose(crossings.each_axis(jnp.asarray(L)), expected, rtol=1e-11)
+    np.testing.assert_allclose(crossings.axis_responses(jnp.asarray(L)), expected, rtol=1e-11)
 
 
 def test_grid_includes_resonances_of_loops_with_an_open_axis():
@@ -75,8 +75,8 @@ def test_grid_includes_resonances_of_loops_with_an_open_axis():
     turns = [size * np.array([[np.cos(at), -np.sin(at)], [np.sin(at), np.cos(at)]]) for at in (0.7, 1.3)]
     a, b = np.kron([[1.0, 0.0], [0.0, 0.0]], turns[0]) + np.kron([[0.0, 0.0], [0.0, 1.0]], turns[1]), np.eye(4)[:, ::2]
     opening = linear.Opening(jnp.asarray(a), jnp.asarray(b), jnp.asarray(-0.3 * b.T))
-    w = np.asarray(crossings.grid(crossings.poles_of(opening), h))
-    for at in (0.7, 1.3):  # the nearest offset in `AROUND` is 0.3 times the damping of 1e-5 rad per period
+    w = np.asarray(crossings.frequency_grid(crossings.poles_of(opening), h))
+    for at in (0.7, 1.3):  # the nearest offset in `POLE_OFFSETS` is 0.3 times the damping of 1e-5 rad per period
         assert np.abs(w * h - at).min() < 0.4e-5
 
 
@@ -119,7 +119,7 @@ def test_margins_equal_those_of_an_independent_transfer_function(k1, period, rat
     assert np.isinf(found.gain_down)  # a double integrator is stable with any small gain
     late = float(found.delay[0]) / period  # `stability_limits` models delayed commands independently
     for share, stable in ((1 - 1e-7, True), (1 + 1e-7, False)):
-        assert (stability_limits.radius(kp, kd, period, delay + share * late) < 1.0) == stable
+        assert (stability_limits.spectral_radius(kp, kd, period, delay + share * late) < 1.0) == stable
 
 
 def test_gain_margin_of_a_sampled_double_integrator():
@@ -172,14 +172,14 @@ def _simulated(parts, run, index, gain, late):
 
     def step(state, _):
         carry, sent = state
-        decision, computer, model = linear._computed(parts, k2, period, carry, carry.x)
+        decision, computer, model = linear._run_computer(parts, k2, period, carry, carry.x)
         sent = jnp.concatenate([(gain * decision.u)[None], sent[:-1]])
         whole = jnp.floor(late).astype(int)
         part = jnp.max(late - whole)  # only one axis is delayed
         new = sent[whole + delay, axes]
         old = jnp.where(late > 0.0, sent[whole + delay + 1, axes], new)
         spans = [(old, now.t, part * dt), (new, now.t + part * dt, (1.0 - part) * dt)]
-        x, acting = linear._acted(parts, carry, decision.w, spans)
+        x, acting = linear._apply_commands(parts, carry, decision.w, spans)
         size = jnp.linalg.norm(parts.plant.local_coordinates(carry_0.x, x))
         return (linear.Carry(x, acting, computer, model), sent), jnp.log(size)
 
@@ -229,11 +229,11 @@ KINDS[SLOW] = ALL_AT_ONCE
 
 @pytest.mark.parametrize("kind", short(KINDS, [SLOW]))
 def test_nominal_run_equals_the_simulated_run(kind):
-    """`linear.nominal` and `rollout.simulate` give the same states without noise and disturbance."""
+    """`linear.simulate_nominal` and `rollout.simulate` give the same states without noise and disturbance."""
     law = {"controller": {"t_f": 10.0, "delta": 0.5}}
     parts = scenario.study(scenario.from_tables({**KINDS[kind], **law})).parts
     log = fly(linear.quiet(parts)).log
-    run = linear.nominal_jit(parts)
+    run = linear.simulate_nominal_jit(parts)
     sizes = jax.jit(jax.vmap(parts.plant.local_coordinates))(jax.tree.map(lambda v: v[:-1], log.x), run.carry.x)
     np.testing.assert_allclose(sizes, 0.0, atol=1e-11)  # rounding, in rad and rad/s of order 1
 
@@ -250,20 +250,20 @@ def test_loops_predict_the_deviation_of_a_neighbouring_run():
     """The deviation includes the complete state and the delayed commands, at every sample around the hand-over."""
     parts = scenario.study(scenario.from_tables(TURNING)).parts
     aside = parts.plant.retract(parts.initial, 1e-7 * jnp.asarray([1.0, -2.0, 1.5, 0.3, 0.2, -0.4]))
-    run, other = (linear.nominal_jit(replace(parts, initial=x)) for x in (parts.initial, aside))
-    periods = np.arange(72, 72 + linear.TOGETHER)
-    loops = linear.opened_in(parts, run, periods).loop
+    run, other = (linear.simulate_nominal_jit(replace(parts, initial=x)) for x in (parts.initial, aside))
+    periods = np.arange(72, 72 + linear.PERIODS_PER_CALL)
+    loops = linear.linearise_periods(parts, run, periods).loop
     assert set(np.asarray(run.period.now.hold)[periods]) == {False, True}
 
     @jax.jit
     @jax.vmap
     def off(base, carry, arriving, others):
-        return jnp.append(Local(linear.quiet(parts), base).local_coordinates(carry), others - arriving)
+        return jnp.append(LocalCoordinates(linear.quiet(parts), base).local_coordinates(carry), others - arriving)
 
     k = np.append(periods, periods[-1] + 1)
     between = np.asarray(off(*jax.tree.map(lambda v: v[k], (run.carry, other.carry, run.command, other.command))))
     each = [jax.tree.map(lambda v, j=j: v[j], loops) for j in range(len(periods))]
-    closed = np.stack([linear.at_input(loop, xp=np).closed() for loop in each])
+    closed = np.stack([linear.open_at_input(loop, xp=np).closed() for loop in each])
     wrong = between[1:] - np.einsum("jkl,jl->jk", closed, between[:-1])
     assert np.all(np.abs(wrong) < 1e-5 * np.abs(between).max(axis=0) + 1e-14)  # rounding
     # old and new command together act over the whole period; the integration steps differ
@@ -285,9 +285,9 @@ def test_simulated_loop_loses_stability_at_its_margins(kind):
             table["spacecraft"] = {"inertia": moments.tolist()}
             table["observer"] = {"gain": RNG.uniform(5.0, 60.0, 3).tolist()}
         parts = scenario.study(scenario.from_tables(table)).parts
-        run = linear.nominal_jit(parts)
+        run = linear.simulate_nominal_jit(parts)
         index = linear.full_periods(parts, run, hold=True)[-1]
-        loop = jax.tree.map(lambda v: v[0], linear.loops_in(parts, run, np.asarray([index])))
+        loop = jax.tree.map(lambda v: v[0], linear.open_loops(parts, run, np.asarray([index])))
         found, m = of(loop), loop.command.shape[0]
         axis = int(RNG.integers(m))
         only = np.arange(m) == axis
@@ -298,7 +298,7 @@ def test_simulated_loop_loses_stability_at_its_margins(kind):
                 if not 0.0 < border < 1e6:
                     continue
                 gain = np.where(only, share * border, 1.0)
-                expected = np.log(linear.radius(loop, np.diag(gain)))
+                expected = np.log(linear.spectral_radius(loop, np.diag(gain)))
                 if abs(expected) * 3000 > 1.0:  # slower growth would not show in the simulated time
                     growth = simulated(parts, run, index, gain, np.zeros(m))
                     assert (growth > 0.0) == ((share > 1) == (way > 0)), (name, share, growth, expected)
@@ -307,7 +307,7 @@ def test_simulated_loop_loses_stability_at_its_margins(kind):
             late = np.where(only, share * found.delay[axis] / float(loop.period), 0.0)
             growth = simulated(parts, run, index, np.ones(m), late)
             # stored momentum is constant when everything else decays
-            assert (growth > margins.NEUTRAL) == (share > 1), ("delay", share, growth)
+            assert (growth > margins.CIRCLE_TOLERANCE) == (share > 1), ("delay", share, growth)
             checked += 1
     assert checked >= 4
 
@@ -322,7 +322,7 @@ AT_NYQUIST = (1065, 1080, 1111, 1122)
 @jax.jit
 def closed_at_both(loop):
     """Transition matrices after closing the loop that was opened at the sensors, and at the input."""
-    return linear.at_sensors(loop).closed(), linear.at_input(loop).closed()
+    return linear.open_at_sensors(loop).closed(), linear.open_at_input(loop).closed()
 
 
 @pytest.mark.parametrize("delay", [0, 1, 2, 3])
@@ -340,7 +340,7 @@ def test_closed_loop_is_the_same_for_both_openings(delay):
 def test_margins_of_one_input_equal_margins_of_all_at_once():
     """Three integrators also become unstable with less gain."""
     loop = held(*INTEGRATORS, 0.5)
-    found, at_once = of(loop), margins.together(loop)
+    found, at_once = of(loop), margins.simultaneous_margins(loop)
     for name in ("gain_up", "gain_down", "phase", "delay"):
         assert 0.0 < at_once[name] < np.inf
         np.testing.assert_allclose(at_once[name], getattr(found, name)[0], rtol=1e-4)
@@ -354,7 +354,7 @@ def test_phase_margin_of_each_sensor_is_accurate_for_five_integrators():
     """
     poles = -np.array([0.6, 0.6, 0.6, 0.6, 1.0])
     loop = held(np.eye(5, k=1), np.eye(5)[:, 4:], -np.poly(poles)[None, :0:-1], 0.05, sensors=True)
-    opening = jax.tree.map(np.asarray, linear.at_sensors(loop))
+    opening = jax.tree.map(np.asarray, linear.open_at_sensors(loop))
     size = loop.seen.shape[1]
     assert np.abs(np.linalg.eigvals(opening.closed())).max() < 1.0
 
@@ -398,7 +398,7 @@ def test_zeros_of_linear_functions_are_found_exactly():
     def at(k, j):
         return (row - k) * np.exp(0.7j) + (point - j) * np.exp(2.0j)
 
-    zeros_of = jax.jit(lambda values: crossings.zeros_of(values, 2))
+    zeros_of = jax.jit(lambda values: crossings.find_zeros(values, 2))
     for k, j in ((3.3, 4.6), (0.2, 0.7)):
         turned = at(k, j)
         turned[:, -1] = 1.0
@@ -448,7 +448,7 @@ def test_delay_margin_is_found_for_a_crossing_near_the_nyquist_frequency():
         reaching, surface = k1 + 1e-4, np.array([rate**2, 2.0 * rate, 1.0])
         gains = reaching * surface + np.append(0.0, surface[:2])
         loop = held(*INTEGRATORS[:2], -gains[None], 0.05)
-        late = margins.together(loop)["delay"]
+        late = margins.simultaneous_margins(loop)["delay"]
         assert float(of(loop).delay[0]) == pytest.approx(late, rel=1e-4)
         assert 0.01 < late < 0.02
 
@@ -456,14 +456,14 @@ def test_delay_margin_is_found_for_a_crossing_near_the_nyquist_frequency():
 def test_peak_sensitivity_of_all_inputs_is_the_largest_singular_value():
     """The matrix is (I + L)^-1. No axis alone has a larger peak."""
     loop = drawn_loop(LATE[0])
-    opening = linear.at_input(loop)
+    opening = linear.open_at_input(loop)
     a, b, c = (np.asarray(v) for v in (opening.a, opening.b, opening.c))
     z = np.exp(1j * np.pi * np.linspace(1e-3, 1.0, 4000))
     back = np.eye(2) - c @ np.linalg.solve(
         z[:, None, None] * np.eye(len(a)) - a, np.broadcast_to(b, (z.size, *b.shape))
     )
     peak = 20 * np.log10(np.linalg.svd(np.linalg.inv(back), compute_uv=False)[:, 0].max())
-    found = margins.together(loop)["peak_sensitivity"]
+    found = margins.simultaneous_margins(loop)["peak_sensitivity"]
     np.testing.assert_allclose(found, peak, atol=5e-3)  # both on grids
     assert found > of(loop).peak_sensitivity.max() - 5e-3
 
@@ -473,10 +473,10 @@ def test_loop_of_a_slow_star_tracker_is_the_mean_over_its_interval():
     every, law = 4, {"controller": {"t_f": 10.0, "delta": 0.5}}
     slow = KINDS[SLOW]
     parts = scenario.study(scenario.from_tables({**slow, **law})).parts
-    run = linear.nominal_jit(parts)
+    run = linear.simulate_nominal_jit(parts)
     last = int(linear.full_periods(parts, run, hold=True)[-1])
-    each = linear.opened_in(parts, run, np.arange(last - every + 1, last + 1)).loop
-    means = linear.loops_in(parts, run, np.array([last]))
+    each = linear.linearise_periods(parts, run, np.arange(last - every + 1, last + 1)).loop
+    means = linear.open_loops(parts, run, np.array([last]))
     for mean, several in zip(jax.tree.leaves(means), jax.tree.leaves(each), strict=True):
         np.testing.assert_allclose(mean[0], np.mean(several, axis=0), rtol=1e-12, atol=1e-15)
     assert np.ptp(each.a, axis=0).max() > 1e-6
@@ -486,14 +486,14 @@ def test_mean_loop_of_the_hold_phase_excludes_the_approach_phase():
     """This also holds if the error at the hand-over happens to be smaller than the error after it."""
     slow = KINDS[SLOW]
     parts = scenario.study(scenario.from_tables({**slow, "controller": {"t_f": 10.0, "delta": 0.5}})).parts
-    run = linear.nominal_jit(parts)
+    run = linear.simulate_nominal_jit(parts)
     first = int(np.argmax(run.period.now.hold))
     x = run.carry.x
     there = run._replace(
         carry=run.carry._replace(x=x._replace(q=x.q.at[first].set(parts.reference(run.period.now.t[first]).q)))
     )
-    index = int(run_margins._moments(parts, there, jnp.asarray([1.0]))[-1])
-    assert index == first + linear.averaged(parts) - 1
+    index = int(run_margins._find_period_indices_jit(parts, there, jnp.asarray([1.0]))[-1])
+    assert index == first + linear.averaging_periods(parts) - 1
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
@@ -501,18 +501,18 @@ def test_distance_to_the_singularity_is_the_smallest_signed_q4_of_a_run(side):
     """The law is singular at q4 = 0. The sign is relative to the initial state after `align`."""
     slow = KINDS[SLOW]
     parts = scenario.study(scenario.from_tables({**slow, "controller": {"t_f": 10.0, "delta": 0.5}})).parts
-    run = linear.nominal_jit(parts)
+    run = linear.simulate_nominal_jit(parts)
     q = np.asarray(run.carry.x.q) * np.sign(run.carry.x.q[:1, 3:])
     for q4 in (0.2, 4e-4, -0.3):
         turned = jnp.asarray(side * np.vstack([q[:5], [[np.sqrt(1.0 - q4**2), 0.0, 0.0, q4]], q[6:]]))
         there = run._replace(carry=run.carry._replace(x=run.carry.x._replace(q=turned)))
-        np.testing.assert_allclose(run_margins._along(parts, there, 24)[2], q4, rtol=1e-12)
+        np.testing.assert_allclose(run_margins._run_data(parts, there, 24)[2], q4, rtol=1e-12)
 
 
 def test_rounding_near_a_pole_at_one_is_not_a_crossing():
     """Near the poles of stored momentum L is about 1e9, and rounding determines the sign of its imaginary part."""
     seen = jnp.asarray([-1e9 + 1e8j, -1e9 - 1e8j, 3.0 - 3.0j, -2.0 - 1.0j, -2.0 + 3.0j])
-    there, factor = crossings.real_at(seen)
+    there, factor = crossings.real_axis_crossings(seen)
     assert there.tolist() == [False, False, False, True]
     assert factor[-1] == pytest.approx(-np.log(2.0), rel=1e-12)
 
@@ -564,13 +564,13 @@ def test_a_diverging_loop_is_linearised_before_its_error_doubles(growth, last):
     tables = {"plant": {"kind": "chain", "x0": [1.0, 0.0]}, "controller": {"t_f": 5.0, "delta": 0.5},
               "loop": {"mode": "sampled", "period": 0.1, "t_end": 6.65, "window": 1.0}}  # fmt: skip
     parts = scenario.study(scenario.from_tables(tables)).parts
-    run = linear.nominal_jit(parts)
+    run = linear.simulate_nominal_jit(parts)
     hold = np.flatnonzero(linear.is_full(run.period.now, parts.period) & run.period.now.hold)
     assert hold.size == 21
     off = np.asarray(run.carry.x).copy()
     off[hold, 0] = 1e-3 * growth ** np.arange(hold.size)
     grown = run._replace(carry=run.carry._replace(x=jnp.asarray(off)))
-    found = run_margins.moments(parts, grown, jnp.array([1.0]))
+    found = run_margins.find_period_indices(parts, grown, jnp.array([1.0]))
     assert int(found[-1]) - hold[0] == last
     assert abs(float(run.period.now.t[found[0]]) - 4.0) < 0.05 + 1e-9
 
@@ -583,7 +583,7 @@ def test_hold_loop_does_not_depend_on_delta(delta):
     parts = scenario.study(scenario.from_tables(tables)).parts
 
     def in_hold(delta):
-        loops, _ = run_margins.judged_loops(with_gains(parts, {"delta": delta}), late=False)
+        loops, _ = run_margins.judged_loops(with_gains(parts, {"delta": delta}), fractional_delays=False)
         return jax.tree.map(lambda v: v[-1], loops)
 
     loop, slopes = jax.jit(lambda by: jax.jvp(in_hold, (by,), (1.0,)))(delta)
@@ -616,12 +616,12 @@ def test_lapack_receives_one_matrix_at_a_time():
     traces = {
         "each": margins.compute_each.trace(loops),
         "their slopes": jax.make_jaxpr(with_gradients)(1.0),
-        "roughly": jax.make_jaxpr(lambda loops: jax.lax.map(margins.roughly, loops))(loops),
+        "roughly": jax.make_jaxpr(lambda loops: jax.lax.map(margins.estimate, loops))(loops),
         "responses": margins._responses.trace(loop),
-        "at rest": limit_cycles._nonlinear_residual.trace(body, jax.eval_shape(linear.nominal, body)),
+        "at rest": limit_cycles._nonlinear_residual.trace(body, jax.eval_shape(linear.simulate_nominal, body)),
     }
     for name, trace in traces.items():
-        solved = [e for e in equations(trace.jaxpr) if e.primitive.name in lapack.COUNTED | lapack.SHARED]
+        solved = [e for e in equations(trace.jaxpr) if e.primitive.name in lapack.SIZE_LIMITED | lapack.NEVER_BATCHED]
         most = 2 if lapack.CAN_DEADLOCK or name != "at rest" else 3
         assert max(e.invars[0].aval.ndim for e in solved) <= most, name
         assert ("eig" in {e.primitive.name for e in solved}) == (name != "at rest")  # the trace includes LAPACK calls

@@ -35,7 +35,7 @@ CALM = {**SPILLS["controller"], "k1": 0.2, "surface_rate": 0.2}  # a bandwidth t
 @pytest.fixture(autouse=True)
 def few_together(monkeypatch):
     """Compile the program for fewer periods, because most tests here linearise one period."""
-    monkeypatch.setattr(linear, "TOGETHER", 8)
+    monkeypatch.setattr(linear, "PERIODS_PER_CALL", 8)
 
 
 def parts_of(**changes):
@@ -50,10 +50,10 @@ def in_theory(**changes):
 
 def in_hold(parts):
     """The linearised loop of the last full period in the hold phase."""
-    run = linear.nominal_jit(parts)
+    run = linear.simulate_nominal_jit(parts)
     index = linear.full_periods(parts, run, hold=True)[-1:]
     width = np.asarray(parts.controller.sign_width)[None]  # as in `covariance`, to share its compiled program
-    opened = linear.opened_in(parts, run, index, width, late=False)
+    opened = linear.linearise_periods(parts, run, index, width, fractional_delays=False)
     return jax.tree.map(lambda v: np.asarray(v)[0], opened.loop)
 
 
@@ -63,7 +63,10 @@ def test_margins_include_the_mode_and_sensors_see_only_the_body():
     assert jax.eval_shape(lambda loop: margins.compute(loop, sensors=True), loop).gain_up.shape == (6,)
 
     def bears(axis, decibels):
-        return linear.radius(loop, np.diag(10.0 ** (decibels * (np.arange(3) == axis) / 20.0))) < 1.0 + margins.NEUTRAL
+        return (
+            linear.spectral_radius(loop, np.diag(10.0 ** (decibels * (np.arange(3) == axis) / 20.0)))
+            < 1.0 + margins.CIRCLE_TOLERANCE
+        )
 
     assert bears(0, 0.0)
     border = next(decibels for decibels in np.arange(0.0, 60.0, 0.1) if not bears(0, decibels))
@@ -80,7 +83,7 @@ def test_covariance_of_noise_and_random_walk_equals_simulated_trials():
     fly_each = jax.jit(jax.vmap(lambda parts, k: rollout.simulate(parts, np.uint32(0), k), (None, 0)))
     simulated = fly_each(parts_of(**NOISY, **changes), np.arange(512, dtype=np.uint32))
     measured = np.sqrt(np.mean(np.asarray(simulated.metrics.window_error) ** 2))
-    np.testing.assert_allclose(covariance.noise(in_theory(**changes)).window_error, measured, rtol=0.1)
+    np.testing.assert_allclose(covariance.propagate_noise(in_theory(**changes)).window_error, measured, rtol=0.1)
 
 
 def slowest_pair(y):
@@ -92,10 +95,10 @@ def slowest_pair(y):
 def test_simulated_mode_grows_or_decays_like_the_dominant_poles(damping, grows):
     """Only the last 70 periods count, after faster motions have decayed. The loop without the mode is stable."""
     stiff = {**SPILLS["flexible"], "coupling": [[1e-6, 0.0, 0.0]]}
-    assert linear.radius(in_hold(in_theory(flexible=stiff))) < 1.0 + margins.NEUTRAL
+    assert linear.spectral_radius(in_hold(in_theory(flexible=stiff))) < 1.0 + margins.CIRCLE_TOLERANCE
     flexible = {**SPILLS["flexible"], "damping": [damping]}
-    poles = np.abs(np.linalg.eigvals(linear.at_input(in_hold(in_theory(flexible=flexible)), 0.0, np).closed()))
-    radius = poles[np.abs(poles - 1.0) > margins.NEUTRAL].max()  # constant memories have poles at 1
+    poles = np.abs(np.linalg.eigvals(linear.open_at_input(in_hold(in_theory(flexible=flexible)), 0.0, np).closed()))
+    radius = poles[np.abs(poles - 1.0) > margins.CIRCLE_TOLERANCE].max()  # constant memories have poles at 1
     assert radius > 1.01 if grows else radius < 0.99
     log = fly(parts_of(flexible=flexible)).log
     ringing = log.x.modes.e[log.has_length][-72:-1, 0]

@@ -48,7 +48,7 @@ def simulated_radius(kp, kd, h, late):
 def test_spectral_radius_equals_growth_of_time_stepping(late):
     for kp, kd in ((0.2, 0.5), (1.0, 0.9), (0.05, 0.2)):
         np.testing.assert_allclose(
-            stability_limits.radius(kp, kd, 1.0, late), simulated_radius(kp, kd, 1.0, late), rtol=0.03
+            stability_limits.spectral_radius(kp, kd, 1.0, late), simulated_radius(kp, kd, 1.0, late), rtol=0.03
         )
 
 
@@ -84,4 +84,4 @@ def test_smallest_delta_puts_the_last_sample_before_the_hand_over_at_the_stabili
     tau = delta / h + anchored + implicit
     kp, kd = stability_limits.implicit_gains(eta, tau) if implicit else ((eta / tau) ** 2, (2 * eta - 1) / tau)
     assert delta > 0.0
-    assert stability_limits.radius(kp, kd, 1.0, 1.0) == pytest.approx(1.0, abs=1e-6)
+    assert stability_limits.spectral_radius(kp, kd, 1.0, 1.0) == pytest.approx(1.0, abs=1e-6)

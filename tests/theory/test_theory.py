@@ -89,16 +89,18 @@ def test_sliding_variable_stays_inside_its_envelope(eta, width):
 
 def test_narrowest_sign_is_crossed_in_one_period():
     run = parts(30.0, 3.0, 0.05, inertia=FULL_INERTIA)
-    width = envelopes.narrowest_sign(run, 0.05)
+    width = envelopes.smallest_sign_width(run, 0.05)
     before, _ = rates.boundary_layer(run.controller, run.observer.error_bound().largest)
     # the rate of the boundary layer is inversely proportional to its width
     np.testing.assert_allclose(float(before) * float(run.controller.sign_width) * 0.05, width, rtol=1e-12)
-    np.testing.assert_allclose(envelopes.narrowest_sign(run, 0.1), 2.0 * width, rtol=1e-12)
+    np.testing.assert_allclose(envelopes.smallest_sign_width(run, 0.1), 2.0 * width, rtol=1e-12)
     # the width uses the K2 of a settled observer: e^(-26) of the initial error remains at t_end, here 600 times larger
     unknown = dataclasses.replace(run.observer, initial_error=vector(1.0))
     assert float(unknown.error_bound().largest) < 600.0 * float(run.observer.error_bound().largest)
     np.testing.assert_allclose(
-        envelopes.narrowest_sign(dataclasses.replace(run, observer=unknown), 0.05), width, rtol=600.0 * np.exp(-26.0)
+        envelopes.smallest_sign_width(dataclasses.replace(run, observer=unknown), 0.05),
+        width,
+        rtol=600.0 * np.exp(-26.0),
     )
 
 

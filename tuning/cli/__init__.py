@@ -12,7 +12,7 @@ INTERRUPTED = 130  # exit status
 
 def command() -> None:
     """Run the command line of this process: the first Ctrl-C ends it in one sentence, a second one kills it."""
-    # imports and tracing create millions of objects, hardly any of them in cycles: looking for these takes 0.2 s
+    # Imports and tracing create millions of objects but hardly any reference cycles. Searching for them takes 0.2 s.
     gc.set_threshold(1_000_000)
     atexit.register(gc.freeze)
     os.environ["MPLBACKEND"] = "agg"  # figures are files

@@ -21,7 +21,7 @@ from tuning.cli.options import (
     Seed,
     prepare,
     resumable,
-    whole,
+    whole_number,
 )
 from tuning.errors import UsageError
 from tuning.output import terminal, trials_report
@@ -31,12 +31,12 @@ if TYPE_CHECKING:
     from ptsmc_jax.campaigns.cluster import Cluster
     from tuning.studies.campaign_folder import Folder
 
-CAMPAIGN_SEED = 1000  # not the seed of a search: its trials must not verify the gains
-MOST = 2**32  # trials, whose numbers have 32 bits
+CAMPAIGN_SEED = 1000  # differs from the default seed of a search, whose trials must not verify its gains
+MOST_TRIALS = 2**32  # trial numbers have 32 bits
 
-SHOWN = Group.create_default_parameters()  # in the help
+HELP = Group.create_default_parameters()  # its options appear in the help
 # options of a group exclude each other
-TRIALS, CONFIDENT, PARTS, PLACES = (Group(show=False, validator=MutuallyExclusive()) for _ in range(4))
+TRIALS, STOPPING, PARTS, WHERE = (Group(show=False, validator=MutuallyExclusive()) for _ in range(4))
 
 CampaignFolder = Annotated[Path, Parameter(name="DIR", help="Folder of `ptsmc montecarlo`.")]
 
@@ -46,12 +46,13 @@ def montecarlo(
     /,
     *,
     trials: Annotated[
-        int | None, whole("Number of trials, 1 to 4294967296; default: 10000.", 1, MOST, group=(SHOWN, TRIALS))
+        int | None,
+        whole_number("Number of trials, 1 to 4294967296; default: 10000.", 1, MOST_TRIALS, group=(HELP, TRIALS)),
     ] = None,
     runs: Annotated[
         Path | None,
         Parameter(
-            group=(SHOWN, TRIALS, CONFIDENT),
+            group=(HELP, TRIALS, STOPPING),
             help="Run table, .csv or .parquet, or DIR/runs of --dry-run: each row is a trial. Its columns are named as "
             "in the rows of a campaign; quantities without a column are random, with the random numbers of the columns "
             "`trial` and `seed`.",
@@ -63,7 +64,7 @@ def montecarlo(
         float | None,
         Parameter(
             validator=Number(gt=0, lt=1),
-            group=(SHOWN, CONFIDENT, PARTS),
+            group=(HELP, STOPPING, PARTS),
             help="Stop when the 95 % interval of the fraction of trials that keep each limit is narrower than this "
             "width, between 0 and 1.",
         ),
@@ -74,14 +75,14 @@ def montecarlo(
     shard: Annotated[
         str,
         Parameter(
-            group=(SHOWN, PARTS, PLACES),
+            group=(HELP, PARTS, WHERE),
             help="I/N: simulate the I-th of N shards only, for batch queues; shards may share a folder.",
         ),
     ] = "1/1",
     cluster: Annotated[
         str | None,
         Parameter(
-            group=(SHOWN, PLACES),
+            group=(HELP, WHERE),
             help="Simulate on a Dask cluster: ADDRESS or scheduler file, or local:N for N processes on this machine.",
         ),
     ] = None,
@@ -96,7 +97,7 @@ def montecarlo(
     dry_run: Annotated[
         bool,
         Parameter(
-            group=(SHOWN, PARTS, PLACES),
+            group=(HELP, PARTS, WHERE),
             negative="",
             help="Write the run table of the trials into DIR/runs, and simulate nothing.",
         ),
@@ -112,31 +113,32 @@ def montecarlo(
     Exit status: 0 every requirement met (without requirements: every trial converged at t_f), 1 not met, 2
     configuration error or a full disk, 130 interrupted.
     """
-    this_shard = _shard(shard)
+    this_shard = _parse_shard(shard)
     tls_files = {"tls_ca_file": tls_ca, "tls_client_cert": tls_cert, "tls_client_key": tls_key}
     tls = {name: str(path) for name, path in tls_files.items() if path is not None}
-    confident, clustered, a_part = until_confident is not None, cluster is not None, this_shard != (1, 1) or dry_run
-    for refused, sentence in (
-        (tls and not clustered, "--tls-ca, --tls-cert and --tls-key need --cluster"),
+    has_stop_width, on_cluster = until_confident is not None, cluster is not None
+    is_partial = this_shard != (1, 1) or dry_run
+    for is_refused, message in (
+        (tls and not on_cluster, "--tls-ca, --tls-cert and --tls-key need --cluster"),
         (
             common.force and this_shard != (1, 1),
             "--force starts the whole campaign again, which would delete the rows of other shards, and does not go "
             "with --shard; remove the folder before the first shard starts, or choose another with --out",
         ),
         (
-            clustered and (precision, device) != ("64", "cpu"),
+            on_cluster and (precision, device) != ("64", "cpu"),
             "--cluster simulates on the workers' processors with 64 bits; allowed are --device cpu and --precision 64",
         ),
         (controller and device != "cpu", f"--device is {device}, but must be cpu with --controller"),
     ):
-        if refused:
-            raise UsageError(sentence)
+        if is_refused:
+            raise UsageError(message)
     bits = 32 if precision == "32" else 64
     loaded, path = prepare(scenario, "montecarlo", out, device, bits, trust=common.trust)
     from ptsmc_jax.campaigns import store
     from ptsmc_jax.simulation import catalogues
 
-    if confident and set(loaded.requirements) <= set(catalogues.MARGINS):
+    if has_stop_width and set(loaded.requirements) <= set(catalogues.MARGINS):
         raise UsageError("--until-confident needs [requirements] on metrics in the scenario")
     from tuning.studies import campaign_folder
 
@@ -153,57 +155,63 @@ def montecarlo(
         names = [path.name, *([controller.resolve().name] if controller else ()), *([runs.stem] if runs else ())]
         folder = replace(folder, path=path.with_name("-".join(names)))
     if scenario is not None:
-        searches.say_seen(scenario, seed)
-    if confident:
+        searches.warn_about_seed(scenario, seed)
+    if has_stop_width:
         from tuning.studies import campaign_summary
 
-        folder = replace(folder, first_look=campaign_summary.first_look(folder, common.force))
+        folder = replace(folder, first_look=campaign_summary.choose_first_look(folder, common.force))
     _ = folder.campaign  # raises configuration errors before anything is written
     if folder.computer is not None:
         flight_commands.report_parameter_differences(folder.computer)
 
     shared = this_shard != (1, 1) and not dry_run
-    with resumable(common.force), store.in_use(folder.path, shared=shared), _elsewhere(cluster, tls) as elsewhere:
+    with (
+        resumable(common.force),
+        store.lock_folder(folder.path, shared=shared),
+        _connect_cluster(cluster, tls) as workers,
+    ):
         campaign_folder.begin(folder, common.force)
         with CampaignProgress(common.quiet) as report:
             if dry_run:
                 campaign_folder.write_run_table(folder, report)
-                done = folder
+                simulated = folder
             else:
-                done = _simulated(folder, this_shard, report, elsewhere, until_confident)
-        if not a_part:
-            return _summarised(done, common.quiet, common.figures)
+                simulated = _simulate_shard(folder, this_shard, report, workers, until_confident)
+        if not is_partial:
+            return _summarise(simulated, common.quiet, common.figures)
     if not common.quiet:
-        _print_shard(done, this_shard, dry_run=dry_run)
+        _print_shard(simulated, this_shard, dry_run=dry_run)
     return 0
 
 
 def _print_shard(folder: "Folder", this_shard: tuple[int, int], *, dry_run: bool) -> None:
     """Print that a shard of a campaign, or its run table, is done."""
     if dry_run:
-        terminal.say(f"run table of {folder.trials} trials in {folder.dry.folder}; nothing was simulated")
+        terminal.print_lines(
+            f"run table of {folder.trials} trials in {folder.dry_run_rows.folder}; nothing was simulated"
+        )
         return
-    there = sum(part.count for part in folder.rows.parts()[0])
-    terminal.say(
-        f"shard {this_shard[0]}/{this_shard[1]} done: {there} of {folder.trials} trials are in {folder.path}",
+    simulated = sum(part.count for part in folder.rows.parts()[0])
+    terminal.print_lines(
+        f"shard {this_shard[0]}/{this_shard[1]} done: {simulated} of {folder.trials} trials are in {folder.path}",
         "when all are there, in this folder or gathered into one: ptsmc summarize DIR",
     )
 
 
-def _elsewhere(cluster: str | None, tls: dict[str, str]) -> "contextlib.AbstractContextManager[Cluster | None]":
-    """Return the context of a cluster, or of None without one."""
+def _connect_cluster(cluster: str | None, tls: dict[str, str]) -> "contextlib.AbstractContextManager[Cluster | None]":
+    """Return a context manager that connects to a cluster. Its value is None if there is no cluster."""
     if cluster is None:
         return contextlib.nullcontext()
     from ptsmc_jax.campaigns import cluster as clusters
 
-    return contextlib.closing(clusters.connected(cluster, tls))
+    return contextlib.closing(clusters.connect(cluster, tls))
 
 
-def _simulated(
+def _simulate_shard(
     folder: "Folder",
     this_shard: tuple[int, int],
     report: CampaignProgress,
-    elsewhere: "Cluster | None",
+    workers: "Cluster | None",
     width: float | None,
 ) -> "Folder":
     """Simulate a shard of a campaign; width: see --until-confident."""
@@ -211,14 +219,14 @@ def _simulated(
 
     campaign_theory.prepare(folder)
     if width is None:
-        campaign_folder.simulate(folder, this_shard, report, elsewhere)
+        campaign_folder.simulate(folder, this_shard, report, workers)
     else:
         from tuning.studies import campaign_summary  # imported during the simulation
 
-        stopped = campaign_summary.until_confident(
-            folder, width, lambda first: campaign_folder.simulate(folder, this_shard, report, elsewhere, first)
+        trial_count = campaign_summary.until_confident(
+            folder, width, lambda first: campaign_folder.simulate(folder, this_shard, report, workers, first)
         )
-        folder = campaign_folder.settle(folder, stopped)
+        folder = campaign_folder.write_trial_count(folder, trial_count)
     campaign_theory.write_missing(folder)
     return folder
 
@@ -229,17 +237,17 @@ def summarize(folder: CampaignFolder, /, *, quiet: Quiet = False, figures: Figur
     Exit status: 0 every requirement met (without requirements: every trial converged at t_f), 1 not met or not
     finished, 2 configuration error or damaged rows.
     """
-    _configured(folder)
+    _configure_jax(folder)
     from ptsmc_jax.campaigns import store
     from tuning.studies import campaign_folder
 
-    campaign = campaign_folder.opened(folder)
+    campaign = campaign_folder.open_folder(folder)
     try:
-        with store.in_use(folder, shared=True):
-            return _summarised(campaign, quiet, figures)
+        with store.lock_folder(folder, shared=True):
+            return _summarise(campaign, quiet, figures)
     except store.InUseError as error:
         print(f"ptsmc: {error}; the summary is printed and not written", file=sys.stderr)
-        return _summarised(campaign, quiet, figures, write=False)
+        return _summarise(campaign, quiet, figures, write=False)
 
 
 def worst(
@@ -253,7 +261,7 @@ def worst(
             "`controller_ok`."
         ),
     ] = "window_error",
-    n: Annotated[int, whole("Number of trials, 1 to 10000.", 1, 10_000, name=("--n", "-n"))] = 5,
+    n: Annotated[int, whole_number("Number of trials, 1 to 10000.", 1, 10_000, name=("--n", "-n"))] = 5,
     why: Annotated[
         bool,
         Parameter(
@@ -267,24 +275,24 @@ def worst(
 
     Exit status: 0 done, 2 configuration error.
     """
-    _configured(folder)
+    _configure_jax(folder)
     from ptsmc_jax import scenario as scenarios
     from ptsmc_jax.campaigns import store
     from tuning.studies import campaign_folder, campaign_summary, reasons
 
-    opened = campaign_folder.opened(folder)
-    frame = campaign_summary.worst(opened, by, n)
+    campaign = campaign_folder.open_folder(folder)
+    frame = campaign_summary.worst_trials(campaign, by, n)
     store.write_csv(folder / "worst.csv", frame.columns, frame.rows())
     inputs = []
     if why:
-        required = [requirement.metric for requirement in scenarios.requirements(opened.scenario)]
-        inputs = reasons.why(opened, list(dict.fromkeys((by, *required))), n)
+        required = [requirement.metric for requirement in scenarios.requirements(campaign.scenario)]
+        inputs = reasons.explain_worst_trials(campaign, list(dict.fromkeys((by, *required))), n)
         store.write_csv(folder / "why.csv", list(inputs[0]) if inputs else [], [list(row.values()) for row in inputs])
     if not quiet:
-        plant = opened.scenario.plant.kind
-        terminal.table(trials_report.worst(frame, by, plant))
-        terminal.say(trials_report.how_to_replay(frame, folder, custom=bool(opened.programs)))
-        terminal.say(*trials_report.why(inputs, plant))
+        plant = campaign.scenario.plant.kind
+        terminal.print_table(trials_report.worst_trial_table(frame, by, plant))
+        terminal.print_lines(trials_report.replay_hint(frame, folder, is_custom=bool(campaign.custom_code)))
+        terminal.print_lines(*trials_report.explanation_lines(inputs, plant))
     return 0
 
 
@@ -292,7 +300,7 @@ def replay(
     folder: CampaignFolder,
     /,
     *,
-    trial: Annotated[int, whole("Number of the trial.")],
+    trial: Annotated[int, whole_number("Number of the trial.")],
     out: Annotated[Path | None, Parameter(help="Folder for the results; default: DIR/replay/TRIAL.")] = None,
     common: Common = USUAL,
 ) -> int:
@@ -300,36 +308,38 @@ def replay(
 
     Exit status: 0 the run equals its row to 1e-12 (or has no row yet), 1 it does not, 2 configuration error.
     """
-    _configured(folder)
+    _configure_jax(folder)
     from ptsmc_jax.campaigns import store
     from tuning.search import custom_parts
     from tuning.studies import campaign_folder, campaign_summary, single
 
-    opened = campaign_folder.opened(folder)
-    if trial >= opened.trials:
-        raise UsageError(f"--trial is {trial}, but must be a whole number from 0 to {opened.trials - 1}")
-    place = out if out is not None else folder / "replay" / str(trial)
-    store.check(place, common.force or out is None)  # a replay overwrites an earlier one
-    custom_parts.allow(opened.programs, folder, opened.identity, common.trust)
-    opened = replace(opened, trusted=True)
-    with store.in_use(place, force=common.force or out is None):
-        again = campaign_summary.replay(opened, trial)
-        about = opened.scenario, again.run, opened.seed, trial, common.figures, opened.computer
-        # simulate has no rows of run tables and no numbers of 32 bits
-        from_here = opened.table is not None or opened.bits != 64
-        replayed = {"campaign": str(folder.absolute()), "metrics": opened.custom_metrics} if from_here else {}
-        store.write(place, lambda making: single.write(making, *about, replayed))
+    campaign = campaign_folder.open_folder(folder)
+    if trial >= campaign.trials:
+        raise UsageError(f"--trial is {trial}, but must be a whole number from 0 to {campaign.trials - 1}")
+    replay_folder = out if out is not None else folder / "replay" / str(trial)
+    store.check_folder(replay_folder, common.force or out is None)  # a replay overwrites an earlier one
+    custom_parts.allow_results(campaign.custom_code, folder, campaign.identity, common.trust)
+    campaign = replace(campaign, trusted=True)
+    with store.lock_folder(replay_folder, force=common.force or out is None):
+        repeated = campaign_summary.replay(campaign, trial)
+        run_details = campaign.scenario, repeated.run, campaign.seed, trial, common.figures, campaign.computer
+        # `ptsmc simulate` can repeat neither a row of a run table nor a run with 32 bits
+        needs_campaign = campaign.table is not None or campaign.bits != 64
+        origin = {"campaign": str(folder.absolute()), "metrics": campaign.custom_metrics} if needs_campaign else {}
+        store.write_folder(replay_folder, lambda staging: single.write(staging, *run_details, origin))
     if not common.quiet:
         from tuning.output import run_report, summaries
 
-        plant = opened.scenario.plant.kind
-        summary = summaries.run(single.summary(again.run, opened.scenario, opened.computer), plant)
-        terminal.show(run_report.build(summary, plant), place)
-        terminal.say(*trials_report.replayed(again.off, again.rounding, campaign_summary.SAME))
-    return 0 if again.off is None or again.off <= campaign_summary.SAME else 1
+        plant = campaign.scenario.plant.kind
+        summary = summaries.run(single.summary(repeated.run, campaign.scenario, campaign.computer), plant)
+        terminal.print_report(run_report.build(summary, plant), replay_folder)
+        terminal.print_lines(
+            *trials_report.replay_lines(repeated.difference, repeated.rounding, campaign_summary.TOLERANCE)
+        )
+    return 0 if repeated.difference is None or repeated.difference <= campaign_summary.TOLERANCE else 1
 
 
-def _configured(folder: Path) -> None:
+def _configure_jax(folder: Path) -> None:
     """Configure JAX with the precision of the campaign."""
     from ptsmc_jax.campaigns import store
     from ptsmc_jax.configure import configure
@@ -337,7 +347,7 @@ def _configured(folder: Path) -> None:
     configure(keep_programs=True, device="cpu", bits=32 if store.read_versions(folder).get("precision") == 32 else 64)
 
 
-def _summarised(folder: "Folder", quiet: bool, figures: bool, *, write: bool = True) -> int:
+def _summarise(folder: "Folder", quiet: bool, figures: bool, *, write: bool = True) -> int:
     from tuning.studies import campaign_summary
 
     with Progress(quiet) as report:
@@ -348,14 +358,14 @@ def _summarised(folder: "Folder", quiet: bool, figures: bool, *, write: bool = T
     if not quiet:
         from tuning.output import campaign_report, summaries
 
-        terminal.show(campaign_report.build(summaries.read(summaries.Campaign, summary)), folder.path)
+        terminal.print_report(campaign_report.build(summaries.read(summaries.Campaign, summary)), folder.path)
     return 0 if summary["status"] == "met" else 1
 
 
-def _shard(value: str) -> tuple[int, int]:
-    trial, _, of = value.partition("/")
+def _parse_shard(value: str) -> tuple[int, int]:
+    index, _, count = value.partition("/")
     try:
-        parsed = int(trial), int(of)
+        parsed = int(index), int(count)
     except ValueError:
         parsed = (0, 0)
     if not 1 <= parsed[0] <= parsed[1]:

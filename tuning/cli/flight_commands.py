@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from tuning.cli.options import Force, Out, Quiet, Seed, Trust, prepare, whole
+from tuning.cli.options import Force, Out, Quiet, Seed, Trust, prepare, whole_number
 from tuning.errors import UsageError
 from tuning.output import terminal
 
@@ -35,7 +35,7 @@ def export(
             help="Name of the C files, with _ for signs that C does not allow; default: the name of the scenario file."
         ),
     ] = None,
-    trials: Annotated[int, whole("Trials in vectors.csv, 1 to 100.", 1, 100)] = 3,
+    trials: Annotated[int, whole_number("Trials in vectors.csv, 1 to 100.", 1, 100)] = 3,
     seed: Seed = 0,
     reference_input: Annotated[
         bool, Parameter(negative="", help="Make the reference an input instead of a function of time in the C.")
@@ -64,27 +64,28 @@ def export(
     from ptsmc_jax.onboard import folder as controllers
     from ptsmc_jax.onboard import templates
 
-    stem = controllers.identifier(name or scenario.stem)
-    controller = controllers.Controller(loaded, stem, scenario.name, reference_input)
+    c_name = controllers.identifier(name or scenario.stem)
+    controller = controllers.Controller(loaded, c_name, scenario.name, reference_input)
     fmus = controllers.Fmus(fmu, fmu_plant, fmi, not no_binary)
-    with store.in_use(folder, force=force):
-        store.write(folder, lambda making: controllers.write(making, controller, seed, trials, fmus))
+    with store.lock_folder(folder, force=force):
+        store.write_folder(folder, lambda staging: controllers.write(staging, controller, seed, trials, fmus))
     if not quiet:
-        costs = ", ".join(f"{n} {what}" for what, n in templates.operations(controller.code.counts).items() if n)
+        counts = templates.count_operations(controller.code.counts)
+        costs = ", ".join(f"{count} {operation}" for operation, count in counts.items() if count)
         check = f"make -C {shlex.quote(str(folder))} check"
-        written = ", ".join(["controller", *fmus.files])
-        terminal.say(f"a step takes at most {costs}", f"{written} in {folder}; {check}")
+        outputs = ", ".join(["controller", *fmus.files])
+        terminal.print_lines(f"a step takes at most {costs}", f"{outputs} in {folder}; {check}")
     return 0
 
 
 def on_flight_clock(scenario: "Scenario") -> "Scenario":
-    """Return the scenario on the flight clock of exported C. Raises ScenarioError without one."""
+    """Return the scenario on the flight clock of exported C code. Raises ScenarioError if C cannot control it."""
     from ptsmc_jax.onboard import folder
 
     return folder.on_flight_clock(scenario)
 
 
-def compiled(controller: Path, ready: "Study") -> "InTheLoop":
+def compile_controller(controller: Path, ready: "Study") -> "InTheLoop":
     """Compile the C of a folder for the parts of a study, and print which parameters differ.
 
     Raises ScenarioError if it does not compile or belongs to other parts.

@@ -46,10 +46,10 @@ def identify(
             if design
             else "give at least one log file after the scenario, or --design"
         )
-    limits = {"--duration": duration, "--rate": rate, "--torque": torque}
-    alone = next((name for name, value in limits.items() if value is not None), None)
-    if alone is not None and not design:
-        raise UsageError(f"{alone} is {limits[alone]}, but must be absent without --design")
+    design_options = {"--duration": duration, "--rate": rate, "--torque": torque}
+    misplaced = next((name for name, value in design_options.items() if value is not None), None)
+    if misplaced is not None and not design:
+        raise UsageError(f"{misplaced} is {design_options[misplaced]}, but must be absent without --design")
     if design and validate:
         raise UsageError("--validate needs a log for the estimates, and does not go with --design")
     loaded, folder = prepare(scenario, "identify", out, trust=common.trust, force=common.force)
@@ -60,28 +60,30 @@ def identify(
     from tuning.studies import identifying
 
     if design:
-        given = {"duration": duration or 300.0, "rate": rate or designing.RATE, "torque": torque}
-        with store.in_use(folder, force=common.force):
+        settings = {"duration": duration or 300.0, "rate": rate or designing.RATE, "torque": torque}
+        with store.lock_folder(folder, force=common.force):
             with progress.Progress(common.quiet) as report:
-                proposed = designing.design(loaded, **given, report=lambda text: report(text, 0, 0))
+                profile = designing.design(loaded, **settings, report=lambda text: report(text, 0, 0))
             write = identifying.write_design
-            store.write(folder, lambda making: write(making, loaded, proposed, common.figures, given))
+            store.write_folder(folder, lambda staging: write(staging, loaded, profile, common.figures, settings))
         if not common.quiet:
-            summary = identifying.design_summary(proposed, given)
-            terminal.show(identify_report.of_design(summaries.read(summaries.Designed, summary)), folder)
+            summary = identifying.design_summary(profile, settings)
+            terminal.print_report(identify_report.build_design(summaries.read(summaries.Designed, summary)), folder)
         return 0
-    read, others = (
+    fitted, predicted = (
         [telemetry.measurements(loaded, telemetry.read(path), path.name) for path in paths]
         for paths in (logs, validate)
     )
-    with store.in_use(folder, force=common.force):
+    with store.lock_folder(folder, force=common.force):
         with progress.Progress(common.quiet) as report:
-            found = estimation.of_logs(loaded, read, others, report=lambda text: report(text, 0, 0))
+            result = estimation.of_logs(loaded, fitted, predicted, report=lambda text: report(text, 0, 0))
         made_by = {"logs": [str(path) for path in logs], "validate": [str(path) for path in validate]}
-        store.write(folder, lambda making: identifying.write(making, found, common.figures, made_by))
+        store.write_folder(folder, lambda staging: identifying.write(staging, result, common.figures, made_by))
     if not common.quiet:
-        terminal.show(identify_report.build(summaries.read(summaries.Identified, results.summary(found))), folder)
-    return 0 if found.good else 1
+        terminal.print_report(
+            identify_report.build(summaries.read(summaries.Identified, results.summary(result))), folder
+        )
+    return 0 if result.good else 1
 
 
 COMMANDS = (identify,)

@@ -1,4 +1,4 @@
-"""The `ptsmc` command. JAX is imported after the arguments are checked, by commands that compute."""
+"""The `ptsmc` command. Commands that compute import JAX after they have checked their arguments."""
 
 import dataclasses
 import functools
@@ -29,9 +29,9 @@ from tuning.cli.options import (
     Seed,
     SensitivityLimits,
     Times,
-    listed_against,
+    parse_traded_values,
     prepare,
-    whole,
+    whole_number,
 )
 from tuning.errors import UsageError
 from tuning.output import progress, terminal
@@ -55,7 +55,8 @@ def simulate(
     out: Out = None,
     seed: Seed = 0,
     trial: Annotated[
-        int | None, whole("Simulate this dispersed trial; default: nominal parameters with the noise of trial 0.")
+        int | None,
+        whole_number("Simulate this dispersed trial; default: nominal parameters with the noise of trial 0."),
     ] = None,
     controller: flight_commands.ControllerFolder = None,
     aem: Annotated[
@@ -70,29 +71,29 @@ def simulate(
     loaded, folder = prepare(scenario, "simulate", out, trust=common.trust, force=common.force)
     from ptsmc_jax.campaigns import runs, store
     from ptsmc_jax.scenario import study, timing
-    from ptsmc_jax.simulation.computer import OURS
+    from ptsmc_jax.simulation.computer import PYTHON_SOFTWARE
     from tuning.studies import single
 
     if aem and loaded.motion != "spacecraft":
         raise UsageError("--aem is given, but the plant is no spacecraft and has no attitude")
     loaded = loaded if controller is None else flight_commands.on_flight_clock(loaded)
     ready = study(loaded, drawn=trial is not None)
-    computer = None if controller is None else flight_commands.compiled(controller, ready)
-    steps = timing.steps(ready.parts)
+    computer = None if controller is None else flight_commands.compile_controller(controller, ready)
+    steps = timing.count_steps(ready.parts)
     if steps > LONG and not common.quiet:
-        terminal.say(f"simulating {steps} integration steps with their history")
-    with store.in_use(folder, force=common.force):
-        run = runs.simulate(ready, seed, trial, OURS if computer is None else computer.software)
+        terminal.print_lines(f"simulating {steps} integration steps with their history")
+    with store.lock_folder(folder, force=common.force):
+        run = runs.simulate(ready, seed, trial, PYTHON_SOFTWARE if computer is None else computer.software)
 
-        def write(making: Path) -> None:
-            single.write(making, loaded, run, seed, trial, common.figures, computer, aem=aem)
+        def write(staging: Path) -> None:
+            single.write(staging, loaded, run, seed, trial, common.figures, computer, aem=aem)
 
-        store.write(folder, write)
+        store.write_folder(folder, write)
     if not common.quiet:
         from tuning.output import run_report, summaries
 
         summary = summaries.run(single.summary(run, loaded, computer), loaded.plant.kind)
-        terminal.show(run_report.build(summary, loaded.plant.kind), folder)
+        terminal.print_report(run_report.build(summary, loaded.plant.kind), folder)
     return 0 if run.met else 1
 
 
@@ -105,22 +106,22 @@ def reproduce(*, out: Out = None, force: Force = False, quiet: Quiet = False, fi
     from ptsmc_jax.campaigns import store
 
     folder = out if out is not None else Path("out") / "reproduce"
-    store.check(folder, force)
+    store.check_folder(folder, force)
     from ptsmc_jax.configure import configure
 
     configure(keep_programs=True)
     from tuning.studies import reproduction
 
-    with store.in_use(folder, force=force):
+    with store.lock_folder(folder, force=force):
         with progress.Progress(quiet) as report:
             report("simulating the paper's figures", 0, 0)
             reproduced = reproduction.reproduce()
-        store.write(folder, lambda making: reproduction.write(making, reproduced, figures))
+        store.write_folder(folder, lambda staging: reproduction.write(staging, reproduced, figures))
     if not quiet:
         from tuning.output import paper_report, summaries
 
         summary = summaries.read(summaries.Paper, reproduction.summary(reproduced))
-        terminal.show(paper_report.build(summary), folder)
+        terminal.print_report(paper_report.build(summary), folder)
     return 0 if reproduced.ok else 1
 
 
@@ -136,7 +137,7 @@ def map_(
     y: Annotated[
         str | None, Parameter(help="KEY=LOW:HIGH:COUNT; default: controller.delta from a period to t_f / 7 or more.")
     ] = None,
-    trials: Annotated[int, whole("Trials of each pair, 1 to 1000000.", 1, 1_000_000)] = 32,
+    trials: Annotated[int, whole_number("Trials of each pair, 1 to 1000000.", 1, 1_000_000)] = 32,
     out: Out = None,
     seed: Seed = 0,
     device: Device = "cpu",
@@ -150,21 +151,23 @@ def map_(
     from ptsmc_jax.campaigns import store
     from tuning.studies import mapping
 
-    across = mapping.axis(x or mapping.usual_periods(loaded), "--x")
-    up = mapping.axis(y or mapping.usual_deltas(loaded), "--y")
-    if across.key == up.key:
-        raise UsageError(f"--y is {up.text}, but must be another key than --x")
-    with store.in_use(folder, force=common.force):
+    x_axis = mapping.parse_axis(x or mapping.default_period_axis(loaded), "--x")
+    y_axis = mapping.parse_axis(y or mapping.default_delta_axis(loaded), "--y")
+    if x_axis.key == y_axis.key:
+        raise UsageError(f"--y is {y_axis.text}, but must be another key than --x")
+    with store.lock_folder(folder, force=common.force):
         with progress.Progress(common.quiet) as report:
-            simulated = mapping.simulate(
-                loaded, across, up, seed, trials, lambda done, total: report("simulating pairs", done, total)
+            results = mapping.simulate(
+                loaded, x_axis, y_axis, seed, trials, lambda done, total: report("simulating pairs", done, total)
             )
-        store.write(folder, lambda making: mapping.write(making, simulated, seed, common.figures))
+        store.write_folder(folder, lambda staging: mapping.write(staging, results, seed, common.figures))
     if not common.quiet:
         from tuning.output import map_report
 
-        pairs = [dataclasses.asdict(cell) for cell in simulated.cells]
-        terminal.say(*map_report.lines(pairs, (across.key, up.key), loaded.plant.kind), f"results in {folder}")
+        pairs = [dataclasses.asdict(cell) for cell in results.cells]
+        terminal.print_lines(
+            *map_report.summary_lines(pairs, (x_axis.key, y_axis.key), loaded.plant.kind), f"results in {folder}"
+        )
     return 0
 
 
@@ -187,16 +190,16 @@ def margins(
     from ptsmc_jax.campaigns import store
     from tuning.studies import stability
 
-    with store.in_use(folder, force=common.force):
+    with store.lock_folder(folder, force=common.force):
         with progress.Progress(common.quiet) as report:
             report("linearising the loop", 0, 0)
-            ready, course = stability.find(loaded)
-        store.write(folder, lambda making: stability.write(making, ready, course, common.figures))
+            ready, course = stability.find_margins(loaded)
+        store.write_folder(folder, lambda staging: stability.write(staging, ready, course, common.figures))
     summary = stability.summary(ready, course)
     if not common.quiet:
         from tuning.output import margins_report, summaries
 
-        terminal.show(margins_report.build(summaries.read(summaries.Margins, summary)), folder)
+        terminal.print_report(margins_report.build(summaries.read(summaries.Margins, summary)), folder)
     return 0 if summary["stable"] else 1
 
 
@@ -226,12 +229,12 @@ def tune(
     from tuning.studies import posing, tune_files, tuner
 
     loaded = posing.with_tune(loaded)
-    known_by = tune_files.identity(loaded, seed, globally=global_check) | {"device": device}
+    identity = tune_files.identity(loaded, seed, with_global_check=global_check) | {"device": device}
     search = searches.LongSearch(
-        known_by,
+        identity,
         objective_name(loaded.search),
-        work=lambda report, journal: tuner.tune(loaded, seed, report, journal, globally=global_check),
-        write=lambda making, tuning: tune_files.write(making, loaded, tuning, common.figures, known_by),
+        work=lambda report, journal: tuner.tune(loaded, seed, report, journal, with_global_check=global_check),
+        write=lambda staging, tuning: tune_files.write(staging, loaded, tuning, common.figures, identity),
         report=lambda summary: tune_report.build(summaries.tune(summary)),
     )
     return searches.run(search, loaded, folder, force=common.force, quiet=common.quiet)
@@ -257,19 +260,19 @@ def pareto(
 
     Exit status: 0 a point of the front meets every requirement, 1 none does, 2 configuration error, 130 interrupted.
     """
-    listed = listed_against(against, points, times, limits)
+    values = parse_traded_values(against, points, times, limits)
     loaded, folder = prepare(scenario, "pareto", out, device, trust=common.trust)
     from tuning.output import front_report
     from tuning.studies import front, posing, trades
     from tuning.studies import pareto as fronts
 
-    trade = trades.build(against, posing.with_tune(loaded), points, listed)
-    loaded, known_by = trade.scenario, trade.identity(seed) | {"device": device}
+    trade = trades.build(against, posing.with_tune(loaded), points, values)
+    loaded, identity = trade.scenario, trade.identity(seed) | {"device": device}
     search = searches.LongSearch(
-        known_by,
+        identity,
         "window error",
         work=lambda report, journal: fronts.trace(trade, seed, report, journal),
-        write=lambda making, found: fronts.write(making, trade, found, common.figures, known_by),
+        write=lambda staging, traced_front: fronts.write(staging, trade, traced_front, common.figures, identity),
         report=lambda summary: front_report.build(front.read(summary)),
     )
     return searches.run(search, loaded, folder, force=common.force, quiet=common.quiet)
@@ -304,15 +307,15 @@ def compare(
     rivals.check()
     comparing.check(loaded)
     loaded = posing.with_tune(loaded)
-    posed = functools.cache(lambda: comparing.that_can_be_simulated(loaded, rivals))
-    known_by = comparing.identity(loaded, seed, rivals) | {"device": device}
+    validated = functools.cache(lambda: comparing.validated_contenders(loaded, rivals))
+    identity = comparing.identity(loaded, seed, rivals) | {"device": device}
     search = searches.LongSearch(
-        known_by,
+        identity,
         objective_name(loaded.search),
-        work=lambda report, journal: comparing.compare(loaded, seed, report, journal, posed()),
-        write=lambda making, comparison: comparing.write(making, loaded, comparison, common.figures, known_by),
+        work=lambda report, journal: comparing.compare(loaded, seed, report, journal, validated()),
+        write=lambda staging, comparison: comparing.write(staging, loaded, comparison, common.figures, identity),
         report=lambda summary: compare_report.build(summaries.read(summaries.Compare, summary)),
-        check=posed,
+        check=validated,
     )
     return searches.run(search, loaded, folder, force=common.force, quiet=common.quiet)
 
@@ -326,7 +329,7 @@ def completion(
 
     Exit status: 0 done, 2 configuration error.
     """
-    terminal.say(app.generate_completion(shell=shell))
+    terminal.print_lines(app.generate_completion(shell=shell))
     return 0
 
 
@@ -346,49 +349,49 @@ def main() -> None:
         print(f"ptsmc: interrupted; {error if error.args else 'nothing was written'}", file=sys.stderr)
         status = INTERRUPTED
     except UnusedCliTokensError as error:
-        _fail(_too_many(error))
+        _fail(_describe_unused_arguments(error))
     except CycloptsError as error:
         refused = error.__cause__
         _fail(str(refused) if isinstance(refused, UsageError) else " ".join(str(error).split()))
     except ValueError as error:
-        _fail(str(error) if _expected(error) else _in_custom_code(error))
+        _fail(str(error) if _is_configuration_error(error) else _describe_custom_code_error(error))
     except OSError as error:
         name = error.filename2 or error.filename  # the target of a move; unknown if the disk is full
         _fail(f"{error.strerror or error}{'' if name is None else f': {name}'}")
     except (Exception, SystemExit) as error:  # custom code may exit
-        _fail(_in_custom_code(error))
+        _fail(_describe_custom_code_error(error))
     finally:
         if (programs := sys.modules.get("ptsmc_jax.programs")) is not None:
-            programs.stop()  # exiting waits for compilations
+            programs.cancel_prepared()  # exiting waits for compilations
     sys.exit(status if isinstance(status, int) else 0)
 
 
-def _too_many(error: UnusedCliTokensError) -> str:
+def _describe_unused_arguments(error: UnusedCliTokensError) -> str:
     """Return the message about arguments that a command does not take."""
     command, unused = " ".join(error.command_chain or ()), " ".join(error.unused_tokens or ())
     return f"{command} does not take {unused}; its arguments: ptsmc {command} --help"
 
 
-def _expected(error: ValueError) -> bool:
+def _is_configuration_error(error: ValueError) -> bool:
     from ptsmc_jax.campaigns.store import RefusedError
     from ptsmc_jax.scenario.errors import ScenarioError
 
     return isinstance(error, ScenarioError | RefusedError | UsageError)
 
 
-def _in_custom_code(error: BaseException) -> str:
+def _describe_custom_code_error(error: BaseException) -> str:
     """Return the message about an error in custom code; raise the error again if it is not from custom code."""
     systems = sys.modules.get("ptsmc_jax.scenario.systems")
-    file = None if systems is None else systems.at_fault(error)
+    file = None if systems is None else systems.find_faulty_file(error)
     if file is None:
         raise error
-    from ptsmc_jax.scenario.custom_checks import what_fails
+    from ptsmc_jax.scenario.custom_checks import describe_failure
 
-    return f"{file} {what_fails(error, file)}"
+    return f"{file} {describe_failure(error, file)}"
 
 
-def _fail(sentence: str) -> None:
-    """Print a sentence with control characters as escapes, and exit."""
-    shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in sentence)
-    print(f"ptsmc: {shown}", file=sys.stderr)
+def _fail(message: str) -> None:
+    """Print a sentence with its control characters escaped, and exit with status 2."""
+    printable = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in message)
+    print(f"ptsmc: {printable}", file=sys.stderr)
     sys.exit(2)

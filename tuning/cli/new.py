@@ -1,4 +1,4 @@
-"""`ptsmc new`: a scenario with every key of its plant, its value, unit and meaning; keys that are off are comments."""
+"""`ptsmc new`: write a scenario file with value, unit and meaning of every key. Unused keys are comments."""
 
 import textwrap
 from collections.abc import Iterator, Mapping
@@ -18,7 +18,7 @@ from ptsmc_jax.simulation import catalogues
 from tuning.errors import UsageError
 
 COLUMN, WIDTH = 36, 120  # first column of the meanings, and length of the lines
-# Values of keys that are off and have no default.
+# Example values of keys without a default.
 EXAMPLES: dict[str, Any] = {
     "plant.system": "my_plant.py:my_plant",
     "controller.code": "my_parts.py:MyLaw",
@@ -90,126 +90,127 @@ A scenario for ptsmc. Every key is optional: an absent key has the value shown h
 The keys of other kinds follow a table, and replace the keys of its kind."""
 
 
-class _File:
+class _ScenarioFile:
     """The lines of a scenario file."""
 
     def __init__(self, stated: Scenario, resolved: Scenario):
         self.resolved, self.plant = resolved, resolved.plant.kind
-        self.live = parsing.as_parsed(stated)
+        self.stated_tables = parsing.to_raw_tables(stated)
         self.values = parsing.dump(resolved)
-        # with the gains that are known without running custom code
-        default = parsing.plain(free_gains.resolve(resolved, Tune()))
+        # including the default gains, if they are known without running custom code
+        default = parsing.to_dict(free_gains.resolve(resolved, Tune()))
         self.values["tune"] = {**default, **self.values.get("tune", {})}
 
     def lines(self) -> Iterator[str]:
         """Return all lines."""
-        yield from _prose(INTRODUCTION)
+        yield from _comment_lines(INTRODUCTION)
         for name, table in layouts.TABLES[self.plant].items():
             if name == "tune":
-                yield from ("", *self.requirements())
-            yield from ("", *(self.dispersion() if name == "dispersion" else self.table(name, table)))
+                yield from ("", *self.requirement_lines())
+            yield from ("", *(self.dispersion_lines() if name == "dispersion" else self.table_lines(name, table)))
 
-    def table(self, name: str, table: type[Table] | layouts.Kinds) -> Iterator[str]:
+    def table_lines(self, name: str, table: type[Table] | layouts.Kinds) -> Iterator[str]:
         """Return the lines of a table, followed by the keys of its other kinds."""
-        live, values = self.live.get(name), self.values.get(name, {})
+        stated, values = self.stated_tables.get(name), self.values.get(name, {})
         kinds = table if isinstance(table, Mapping) else {}
         kind = self.plant if name == "plant" else values.get("kind", next(iter(kinds), None))
         struct = table if isinstance(table, type) else kinds[kind]
         if kind is None:
-            yield from _prose(keys.about(struct))
-        yield f"{'#' if live is None else ''}[{name}]"
-        yield from self.kind(name, kind, struct, live, values)
+            yield from _comment_lines(keys.description(struct))
+        yield f"{'#' if stated is None else ''}[{name}]"
+        yield from self.kind_lines(name, kind, struct, stated, values)
         declared = struct.__struct_fields__
         if issubclass(struct, Custom):
-            for key in (key for key in live or () if key not in ("kind", *declared)):
-                yield from _line(False, key, values[key], "custom")
+            for key in (key for key in stated or () if key not in ("kind", *declared)):
+                yield from _key_lines(False, key, values[key], "custom")
         if issubclass(struct, Attitude) and name != "initial":
-            yield from _prose("its attitude by one of the keys of [initial]")
+            yield from _comment_lines("its attitude by one of the keys of [initial]")
         for other, alternative in kinds.items():
             if other != kind:
                 yield ""
-                yield from self.kind(name, other, alternative, None, {})
+                yield from self.kind_lines(name, other, alternative, None, {})
 
-    def kind(
-        self, name: str, kind: str | None, struct: type[Table], live: dict[str, Any] | None, values: dict[str, Any]
+    def kind_lines(
+        self, name: str, kind: str | None, struct: type[Table], stated: dict[str, Any] | None, values: dict[str, Any]
     ) -> Iterator[str]:
         """Return the lines of the keys of one kind of a table.
 
         Args:
-            name: of the table.
-            kind: its kind; None: the table has no kinds.
-            struct: of the kind.
-            live: the keys in the scenario; None: all lines are comments.
+            name: name of the table.
+            kind: kind of the table; None: the table has no kinds.
+            struct: declaration of the keys of this kind.
+            stated: the keys in the scenario; None: all lines are comments.
             values: the values that the scenario states or implies.
         """
         if kind is not None:
-            yield from _line(live is None, "kind", kind, keys.about(struct))
-        values = {**self.defaults(name, struct), **values}
-        borrowed = Attitude.__struct_fields__ if name != "initial" else ()  # explained at [initial]
+            yield from _key_lines(stated is None, "kind", kind, keys.description(struct))
+        values = {**self.default_values(name, struct), **values}
+        borrowed = Attitude.__struct_fields__ if name != "initial" else ()  # the file explains them at [initial]
         for key in keys.list_keys(struct, self.resolved.unit_of_d):
-            off = live is None or key.name not in live
-            if f"{name}.{key.name}" in layouts.KINDS:
-                yield from self.inline(name, key, (live or {}).get(key.name, {}), layouts.KINDS[f"{name}.{key.name}"])
-            elif not (off and key.name in borrowed):
-                value = values[key.name] if key.name in values else self.example(name, kind, key)
-                yield from _line(off, key.name, value, _meaning(key))
+            is_off = stated is None or key.name not in stated
+            kinds = layouts.KINDS.get(f"{name}.{key.name}")
+            if kinds is not None:
+                yield from self.inline_lines(name, key, (stated or {}).get(key.name, {}), kinds)
+            elif not (is_off and key.name in borrowed):
+                value = values[key.name] if key.name in values else self.example_value(name, kind, key)
+                yield from _key_lines(is_off, key.name, value, _describe_key(key))
 
-    def dispersion(self) -> Iterator[str]:
+    def dispersion_lines(self) -> Iterator[str]:
         """Return a line for each kind of each dispersion."""
-        struct, live = layouts.TABLES[self.plant]["dispersion"], self.live.get("dispersion")
+        struct, stated = layouts.TABLES[self.plant]["dispersion"], self.stated_tables.get("dispersion")
         assert isinstance(struct, type)
-        yield from _prose(keys.about(struct))
-        yield f"{'#' if live is None else ''}[dispersion]"
+        yield from _comment_lines(keys.description(struct))
+        yield f"{'#' if stated is None else ''}[dispersion]"
         for key in keys.list_keys(struct, self.resolved.unit_of_d):
-            chosen = (live or {}).get(key.name, {})
-            yield from self.inline("dispersion", key, chosen, layouts.DISPERSIONS[key.name])
+            chosen = (stated or {}).get(key.name, {})
+            yield from self.inline_lines("dispersion", key, chosen, layouts.DISPERSIONS[key.name])
 
-    def inline(self, name: str, key: keys.Key, chosen: Mapping[str, Any], kinds: layouts.Kinds) -> Iterator[str]:
+    def inline_lines(self, name: str, key: keys.Key, chosen: Mapping[str, Any], kinds: layouts.Kinds) -> Iterator[str]:
         """Return a line for each kind of an inline table.
 
         Args:
-            name: of the table that contains it.
-            key: of the inline table.
+            name: name of the table that contains the inline table.
+            key: key of the inline table.
             chosen: the inline table of the scenario.
             kinds: all kinds.
         """
-        yield from _prose(f"{key.meaning}:")
+        yield from _comment_lines(f"{key.meaning}:")
         for kind, struct in kinds.items():
-            scaled = {key: mission.scales(self.resolved).of(one) for key, one in struct.scaled.items()}
+            scaled = {key: mission.scales(self.resolved).scaled_value(one) for key, one in struct.scaled.items()}
             others = (k for k in keys.list_keys(struct, self.resolved.unit_of_d) if k.name not in scaled)
-            table = {"kind": kind, **scaled, **{k.name: self.example(name, kind, k) for k in others}}
-            mine = chosen.get("kind") == kind
-            yield from _line(not mine, key.name, chosen if mine else table, keys.about(struct))
+            table = {"kind": kind, **scaled, **{k.name: self.example_value(name, kind, k) for k in others}}
+            is_chosen = chosen.get("kind") == kind
+            yield from _key_lines(not is_chosen, key.name, chosen if is_chosen else table, keys.description(struct))
 
-    def requirements(self) -> Iterator[str]:
+    def requirement_lines(self) -> Iterator[str]:
         """Return the requirements of the scenario, or two examples."""
-        catalogue, live = self.resolved.metrics, self.live.get("requirements")
+        catalogue, stated = self.resolved.metrics, self.stated_tables.get("requirements")
         limited = [name for name in catalogue if not name.startswith(catalogues.WITHIN)]  # required by other keys
-        yield from _prose(
+        yield from _comment_lines(
             "The largest allowed value of a metric, in every trial or in a fraction of them, with a confidence. "
             f"A limit may have a unit: {'hold_angle' if 'hold_angle' in catalogue else 'settling_time'} = "
             f'"{"0.05 deg" if "hold_angle" in catalogue else "800 ms"}". The metrics are {", ".join(limited)}. '
             f"The margins of the sampled loop are {', '.join(catalogues.MARGINS)}. The limit is "
             "the smallest allowed margin, or the largest allowed peak sensitivity."
         )
-        yield f"{'#' if live is None else ''}[requirements]"
+        yield f"{'#' if stated is None else ''}[requirements]"
         known = {**catalogue, **catalogues.MARGINS}
-        for name, limit in (live or REQUIREMENTS).items():
+        for name, limit in (stated or REQUIREMENTS).items():
             entry = known[name]
-            yield from _line(live is None, name, limit, f"{entry.meaning} [{entry.unit}]")
+            yield from _key_lines(stated is None, name, limit, f"{entry.meaning} [{entry.unit}]")
 
-    def defaults(self, name: str, struct: type[Table]) -> dict[str, Any]:
+    def default_values(self, name: str, struct: type[Table]) -> dict[str, Any]:
         """Return the defaults of the keys of a table; keys without a default are missing."""
         needed = {"code": EXAMPLES[f"{name}.code"]} if issubclass(struct, Custom) else {}
         needed |= {"t_f": self.resolved.controller.t_f} if issubclass(struct, LawTable) else {}
         table: Any = struct(**needed)
-        table = table.filled(self.resolved) if isinstance(table, PartTable) else table
-        table = mission.with_defaults(table, mission.scales(self.resolved))
-        table = table.written(self.resolved) if isinstance(table, PartTable) else table
-        return {key: value for key, value in parsing.plain(table).items() if value not in ([], {})}
+        table = table.fill_defaults(self.resolved) if isinstance(table, PartTable) else table
+        table = mission.fill_scaled_defaults(table, mission.scales(self.resolved))
+        table = table.complete_for_file(self.resolved) if isinstance(table, PartTable) else table
+        return {key: value for key, value in parsing.to_dict(table).items() if value not in ([], {})}
 
-    def example(self, table: str, kind: str | None, key: keys.Key) -> Any:
-        """Return a value for a key that is off: its default or an example."""
+    def example_value(self, table: str, kind: str | None, key: keys.Key) -> Any:
+        """Return the value that a comment shows for an unused key: its default or an example."""
         if key.default not in (None, (), msgspec.NODEFAULT):
             return key.default
         value = EXAMPLES[f"{table}.{key.name}"]
@@ -220,16 +221,16 @@ class _File:
         return [value] * (4 if kind == "pyramid" else 3) if key.allowed.endswith("for each wheel") else value
 
 
-def text(plant: str | None, raw: Mapping[str, Any]) -> str:
+def scenario_text(plant: str | None, raw: Mapping[str, Any]) -> str:
     """Return a commented scenario file.
 
     Args:
-        plant: its kind; None: that of `raw`, or a spacecraft.
+        plant: kind of the plant; None: the kind in `raw`, or a spacecraft.
         raw: tables of a scenario, see `parsing.load`; empty: the default scenario of the plant.
 
     Raises:
-        ScenarioError: raw is no scenario.
-        UsageError: there is no such plant, or raw has another one.
+        ScenarioError: `raw` is not a valid scenario.
+        UsageError: the kind of the plant is unknown, or `raw` has another kind.
     """
     if plant is not None and plant not in layouts.TABLES:
         raise UsageError(f"--plant is {plant}, but must be {' or '.join(layouts.TABLES)}")
@@ -240,22 +241,22 @@ def text(plant: str | None, raw: Mapping[str, Any]) -> str:
         raise UsageError(f"--plant is {plant}, but the scenario of --like has plant.kind = {stated.plant.kind}")
     # the file of the system does not exist yet, so the scenario cannot be checked
     resolved = reading.resolve(stated) if kind == "system" and not raw else scenario.from_tables(given)
-    return "\n".join(_File(stated, resolved).lines()) + "\n"
+    return "\n".join(_ScenarioFile(stated, resolved).lines()) + "\n"
 
 
-def _meaning(key: keys.Key) -> str:
+def _describe_key(key: keys.Key) -> str:
     choice = f"{key.allowed.replace(' or ', ' | ')}: " if key.allowed.startswith('"') and " or " in key.allowed else ""
     return choice + key.text
 
 
-def _line(off: bool, key: str, value: Any, meaning: str) -> Iterator[str]:
+def _key_lines(off: bool, key: str, value: Any, meaning: str) -> Iterator[str]:
     """Return `key = value  # meaning`; a long meaning is on the lines above."""
     shown = f"{'#' if off else ''}{errors.show_key(key)} = {errors.show(value)}"
     line = f"{shown:<{COLUMN - 1}} # {meaning}"
     if len(line) > WIDTH:
-        yield from _prose(meaning)
+        yield from _comment_lines(meaning)
     yield line if len(line) <= WIDTH else shown
 
 
-def _prose(words: str) -> list[str]:
+def _comment_lines(words: str) -> list[str]:
     return [f"# {line}" for line in textwrap.wrap(words, WIDTH - 2)]

@@ -16,16 +16,16 @@ if TYPE_CHECKING:
     from ptsmc_jax.scenario.tables import Scenario
 
 
-def _integer(_: object, tokens: Sequence[Token]) -> int:
+def _parse_integer(_: object, tokens: Sequence[Token]) -> int:
     text = tokens[0].value
     if not text.removeprefix("-").isdecimal():  # cyclopts would round 2.5
         raise ValueError(f"{text} is no whole number")
     return int(text)
 
 
-def whole(text: str, least: int = 0, most: int = 2**32 - 1, **others: Any) -> Parameter:
-    """Return an option that is a whole number from least to most; text: its help; others: see `Parameter`."""
-    return Parameter(converter=_integer, validator=Number(gte=least, lte=most), help=text, **others)
+def whole_number(text: str, minimum: int = 0, maximum: int = 2**32 - 1, **others: Any) -> Parameter:
+    """Return an option that is a whole number in a range; text: its help; others: see `Parameter`."""
+    return Parameter(converter=_parse_integer, validator=Number(gte=minimum, lte=maximum), help=text, **others)
 
 
 ScenarioFile = Annotated[
@@ -37,7 +37,7 @@ SampledFile = Annotated[
 Out = Annotated[
     Path | None, Parameter(help="Folder for the results; default: out/COMMAND-NAME with the name of the scenario file.")
 ]
-Seed = Annotated[int, whole("Seed of all random numbers, 0 to 4294967295.")]
+Seed = Annotated[int, whole_number("Seed of all random numbers, 0 to 4294967295.")]
 Force = Annotated[bool, Parameter(negative="", help="Write into a folder that is not empty.")]
 Quiet = Annotated[bool, Parameter(negative="", help="Print nothing but errors.")]
 Figures = Annotated[bool, Parameter(negative="--no-figures", help="Draw figures.")]
@@ -85,7 +85,7 @@ FrontAgainst = Annotated[
     Literal["torque", "margins", "t_f"], Parameter(help="Quantity that the accuracy is traded against.")
 ]
 Points = Annotated[
-    int | None, whole("Number of torque limits, each with its own tuned gains, 3 to 100; default: 20.", 3, 100)
+    int | None, whole_number("Number of torque limits, each with its own tuned gains, 3 to 100; default: 20.", 3, 100)
 ]
 Times = Annotated[
     str | None,
@@ -102,22 +102,22 @@ SensitivityLimits = Annotated[
 
 @contextlib.contextmanager
 def resumable(force: bool) -> Iterator[None]:
-    """Let a Ctrl-C report that the same command resumes this work; force: the command had --force."""
+    """Let a Ctrl-C report that the same command resumes this work; force: whether the command had --force."""
     try:
         yield
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(resume_by(force)) from None
+        raise KeyboardInterrupt(how_to_resume(force)) from None
 
 
-def resume_by(force: bool) -> str:
-    """Return how to resume interrupted work; force: the command had --force, which would start again."""
+def how_to_resume(force: bool) -> str:
+    """Return how to resume interrupted work; force: whether the command had --force, which would start again."""
     return f"the same command{' without --force' if force else ''} resumes it"
 
 
 VALUES = {"torque": "--points", "t_f": "--times", "margins": "--limits"}  # option for the values of each quantity
 
 
-def listed_against(against: str, points: int | None, times: str | None, limits: str | None) -> tuple[float, ...]:
+def parse_traded_values(against: str, points: int | None, times: str | None, limits: str | None) -> tuple[float, ...]:
     """Return the times of --times [s] or the limits of --limits [dB], empty without them.
 
     Raises:
@@ -127,21 +127,22 @@ def listed_against(against: str, points: int | None, times: str | None, limits: 
         if value is not None and against != kind:
             raise UsageError(f"{option} is {value}, but must be absent without --against {kind}")
     if times is not None:
-        return _numbers("--times", times, 2, "two times or more in s, all different, such as 20,30,45")
+        return _parse_numbers("--times", times, 2, "two times or more in s, all different, such as 20,30,45")
     if limits is not None:
-        return _numbers("--limits", limits, 1, "limits in dB, greater than 0 and all different, such as 4,6,9")
+        return _parse_numbers("--limits", limits, 1, "limits in dB, greater than 0 and all different, such as 4,6,9")
     return ()
 
 
-def _numbers(option: str, text: str, least: int, allowed: str) -> tuple[float, ...]:
-    """Return positive numbers between commas in ascending order, at least this many."""
+def _parse_numbers(option: str, text: str, fewest: int, allowed: str) -> tuple[float, ...]:
+    """Parse at least `fewest` positive numbers that commas separate, and return them in ascending order."""
     try:
-        listed = tuple(sorted(float(part) for part in text.split(",")))
+        numbers = tuple(sorted(float(part) for part in text.split(",")))
     except ValueError:
-        listed = ()
-    if len(listed) < least or len(set(listed)) < len(listed) or not all(0.0 < value < float("inf") for value in listed):
+        numbers = ()
+    valid = all(0.0 < value < float("inf") for value in numbers)
+    if len(numbers) < fewest or len(set(numbers)) < len(numbers) or not valid:
         raise UsageError(f"{option} is {text}, but must be {allowed}")
-    return listed
+    return numbers
 
 
 def prepare(
@@ -157,13 +158,13 @@ def prepare(
     """Check a scenario and the folder for its results, and configure JAX.
 
     Args:
-        scenario: its file; None: the paper's Case I.
-        command: its name, for the default name of the folder.
+        scenario: path of the scenario file; None: the paper's Case I.
+        command: name of the command, which the default name of the folder contains.
         out: the folder of the option --out.
         device: hardware of the simulations.
-        bits: of every number.
-        trust: code that a scenario in results names may be run.
-        force: the folder may contain files; None: the command checks the folder later.
+        bits: floating-point precision.
+        trust: whether custom code may be run if the scenario is in a result folder.
+        force: whether the folder may contain files; None: the command checks the folder later.
 
     Returns:
         The scenario, and the folder.
@@ -171,7 +172,7 @@ def prepare(
     Raises:
         ScenarioError: the scenario is not valid.
         RefusedError: the folder must not be written to, or the scenario names code that must not be run.
-        UsageError: there is no such device.
+        UsageError: the device is not available.
     """
     from ptsmc_jax.scenario import reading
 
@@ -181,7 +182,7 @@ def prepare(
     if force is not None:
         from ptsmc_jax.campaigns import store
 
-        store.check(folder, force)
+        store.check_folder(folder, force)
     from ptsmc_jax.configure import NoDeviceError, configure
 
     try:
@@ -192,7 +193,7 @@ def prepare(
         from ptsmc_jax.scenario import parsing
         from tuning.search import custom_parts
 
-        if not any(parsing.stated(loaded).values()):
+        if not any(parsing.stated_tables(loaded).values()):
             print(f"ptsmc: {scenario} is empty; the paper's Case I is simulated", file=sys.stderr)
         custom_parts.allow_scenario(scenario, loaded, trust)
     return reading.complete(loaded), folder

@@ -1,4 +1,4 @@
-"""Commands without simulations: a page from results, scenario files, attitudes in every form."""
+"""Commands that do not simulate: write a page of results or a scenario file, and convert attitudes."""
 
 import json
 from importlib.resources import files
@@ -25,11 +25,11 @@ def report(
     from tuning.output import page
 
     page.read(folder)  # raises RefusedError without a result
-    with store.in_use(folder, shared=True):
+    with store.lock_folder(folder, shared=True):
         content = page.build(folder)
-        store.write(folder, lambda making: store.write_text(making / "report.html", content))
+        store.write_folder(folder, lambda staging: store.write_text(staging / "report.html", content))
     if not quiet:
-        terminal.say(f"page in {folder / 'report.html'}")
+        terminal.print_lines(f"page in {folder / 'report.html'}")
     return 0
 
 
@@ -56,9 +56,9 @@ def new(
         raise UsageError(f"FILE is {file}, which is a kind of plant; allowed are --plant {file} and other file names")
     store.check_file(file, force)
     raw = parsing.load(like) if like is not None else {}
-    store.write_text(file, templates.text(plant, raw))
+    store.write_text(file, templates.scenario_text(plant, raw))
     if not quiet:
-        terminal.say(f"scenario in {file}")
+        terminal.print_lines(f"scenario in {file}")
     return 0
 
 
@@ -79,7 +79,7 @@ def schema(
     store.check_file(file, force)
     store.write_text(file, json.dumps(json_schema(), indent=1) + "\n")
     if not quiet:
-        terminal.say(f"JSON Schema in {file}; in a scenario file: #:schema {file}")
+        terminal.print_lines(f"JSON Schema in {file}; in a scenario file: #:schema {file}")
     return 0
 
 
@@ -96,24 +96,24 @@ def examples(
     """
     from ptsmc_jax.campaigns import store
 
-    shipped = sorted(path for path in _examples().iterdir() if path.suffix in (".toml", ".py"))
+    packaged = sorted(path for path in _examples().iterdir() if path.suffix in (".toml", ".py"))
     if folder.exists() and not folder.is_dir():
         raise store.RefusedError(f"the folder is {folder}, but that is a file; allowed is a new or an existing folder")
     folder.mkdir(parents=True, exist_ok=True)
-    for path in shipped:
+    for path in packaged:
         store.check_file(folder / path.name, force)
-    for path in shipped:
+    for path in packaged:
         store.write_text(folder / path.name, path.read_text(encoding="utf-8"))
     if not quiet:
-        terminal.say(f"{len(shipped)} files in {folder}: {', '.join(path.name for path in shipped)}")
+        terminal.print_lines(f"{len(packaged)} files in {folder}: {', '.join(path.name for path in packaged)}")
     return 0
 
 
 def _examples() -> Path:
     """Return the folder of the packaged scenarios: in the package, or at the top of a checkout."""
     package = Path(str(files("ptsmc_jax")))
-    packed = package / "examples"
-    return packed if packed.is_dir() else package.parent / "scenarios"
+    installed = package / "examples"
+    return installed if installed.is_dir() else package.parent / "scenarios"
 
 
 # the first number may be negative
@@ -143,7 +143,7 @@ def convert_attitude(
         "quat_xyzw": quat_xyzw, "quat_wxyz": quat_wxyz, "rotvec_deg": rotvec_deg, "mrp": mrp,
         "dcm_body_to_inertial": dcm_body_to_inertial, "euler_deg": euler_deg, "sequence": sequence,
     }  # fmt: skip
-    terminal.say(*convert.lines(convert.quaternion(texts), sequence))
+    terminal.print_lines(*convert.attitude_lines(convert.parse_quaternion(texts), sequence))
     return 0
 
 

@@ -9,9 +9,9 @@ from ptsmc_jax.numerics import statistics
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.catalogues import percent
 from tuning.output import pointing_report, report
-from tuning.output.formats import digits, listed, many, named_error
+from tuning.output.formats import format_count, format_named_error, format_number, list_counts
 from tuning.output.report import Block, Report, Section, Table, Text
-from tuning.output.run_report import bound, warnings
+from tuning.output.run_report import bound_lines, warning_lines
 from tuning.output.summaries import Campaign, Entry, Quantile
 
 NOTES = {
@@ -25,20 +25,24 @@ NOTES = {
 def build(summary: Campaign) -> Report:
     """Return the report of a campaign."""
     error = summary.quantiles["window_error"].rms
-    first = named_error(error, summary.plant, "RMS ")
-    headline, mood = report.headline(summary.status, summary.verdicts, first)
-    driven = list(drivers(summary))
-    blocks: list[Block] = [*quantiles(summary), *([Text(driven)] if driven else [])]
+    error_text = format_named_error(error, summary.plant, "RMS ")
+    headline, mood = report.headline(summary.status, summary.verdicts, error_text)
+    driven = list(driver_lines(summary))
+    blocks: list[Block] = [*quantile_tables(summary), *([Text(driven)] if driven else [])]
     sections = [
-        *report.requirements(summary.verdicts, verdict),
+        *report.requirement_sections(summary.verdicts, verdict_with_fraction),
         Section("Metrics", blocks),
-        *pointing_report.sections(summary),
+        *pointing_report.pointing_sections(summary),
     ]
-    lines = [*bound(error, summary.lower_bound, summary.plant), *counts(summary), *warnings(summary.warnings)]
+    lines = [
+        *bound_lines(error, summary.lower_bound, summary.plant),
+        *count_lines(summary),
+        *warning_lines(summary.warnings),
+    ]
     return Report(headline, mood, lines, sections)
 
 
-def verdict(entry: Entry) -> str:
+def verdict_with_fraction(entry: Entry) -> str:
     """Return a verdict with the fraction of trials within the limit."""
     text = str(entry)
     if entry.fraction_of_time is not None or entry.fraction is None or entry.fraction_interval is None:
@@ -53,51 +57,60 @@ def verdict(entry: Entry) -> str:
     return text
 
 
-def counts(summary: Campaign) -> Iterator[str]:
+def count_lines(summary: Campaign) -> Iterator[str]:
     """Return how the trials ended, and the reasons of failures."""
     if summary.simulated < summary.trials:
         yield f"NOT finished: {summary.simulated} of {summary.trials} trials are simulated"
     for name in summary.unjudged:
         yield f"NOT finished: {name} is required and not judged yet; run the same `ptsmc montecarlo` again"
     source = f"the run table {summary.run_table} and seed" if summary.run_table else "seed"
-    yield f"{many(summary.simulated, 'trial')} of {source} {summary.seed}: {listed(summary.counts)}"
+    yield f"{format_count(summary.simulated, 'trial')} of {source} {summary.seed}: {list_counts(summary.counts)}"
     for reason in summary.reasons:
-        first = "" if reason.first_bad_time is None else f", the first at {reason.first_bad_time:.4g} s"
-        yield f"  {reason.trials} {reason.status}: {reason.reason}{first}"
-    ended = {status: one for status, one in summary.controller_samples.items() if one.samples}
-    if ended:
-        each = (f"{one.samples} {status} in {many(one.trials, 'trial')}" for status, one in ended.items())
-        yield f"samples of the controller: {', '.join(each)}"
+        first_time = "" if reason.first_bad_time is None else f", the first at {reason.first_bad_time:.4g} s"
+        yield f"  {reason.trials} {reason.status}: {reason.reason}{first_time}"
+    controller_samples = {
+        status: status_samples
+        for status, status_samples in summary.controller_samples.items()
+        if status_samples.samples
+    }
+    if controller_samples:
+        numbers = (
+            f"{status_samples.samples} {status} in {format_count(status_samples.trials, 'trial')}"
+            for status, status_samples in controller_samples.items()
+        )
+        yield f"samples of the controller: {', '.join(numbers)}"
     if summary.run_table:
         yield "fractions, quantiles and intervals assume random trials; they hold as far as the run table is random"
 
 
-def quantiles(summary: Campaign) -> list[Table]:
+def quantile_tables(summary: Campaign) -> list[Table]:
     """Return the quantiles of every metric; metrics that are better when larger have a table of their own."""
     heads = {"max": ("", "median", "99.73 %", "its 95 % interval", "largest", "unit"),
              "min": ("", "median", "99.73 % reach", "its 95 % interval", "smallest", "unit")}  # fmt: skip
-    tables = [Table(head, _rows(summary, extreme), NOTES[extreme]) for extreme, head in heads.items()]
+    tables = [Table(head, _quantile_rows(summary, bad_end), NOTES[bad_end]) for bad_end, head in heads.items()]
     return [table for table in tables if table.rows]
 
 
-def _rows(summary: Campaign, extreme: str) -> list[tuple[str, ...]]:
+def _quantile_rows(summary: Campaign, bad_end: str) -> list[tuple[str, ...]]:
     """Return the rows of the metrics whose bad end is "max" or "min"."""
     rows: list[tuple[str, ...]] = []
     units = catalogues.units(summary.plant)
     failed = sum(count for status, count in summary.counts.items() if status not in ("ok", "not_converged"))
-    for name, found in summary.quantiles.items():
-        far: Quantile | None = found.high if extreme == "max" else found.low
-        if pointing_report.is_index(name) or far is None:
+    for name, metric_quantiles in summary.quantiles.items():
+        tail: Quantile | None = metric_quantiles.high if bad_end == "max" else metric_quantiles.low
+        if pointing_report.is_index(name) or tail is None:
             continue
-        never = found.without_value > failed  # trials without a value, such as runs that end but never settle
-        largest = "none" if never else digits(getattr(found, extreme), ".3g")
-        between = f"{digits(far.low, '.3g')}..{digits(far.high, '.3g')}"
-        values = (digits(found.median.value, ".3g"), digits(far.value, ".3g"))
-        rows.append((name, *values, between, largest, units.get(name, "")))
+        has_missing_values = (
+            metric_quantiles.without_value > failed
+        )  # trials without a value, such as runs that end but never settle
+        largest = "none" if has_missing_values else format_number(getattr(metric_quantiles, bad_end), ".3g")
+        tail_interval = f"{format_number(tail.low, '.3g')}..{format_number(tail.high, '.3g')}"
+        values = (format_number(metric_quantiles.median.value, ".3g"), format_number(tail.value, ".3g"))
+        rows.append((name, *values, tail_interval, largest, units.get(name, "")))
     return rows
 
 
-def drivers(summary: Campaign) -> Iterator[str]:
+def driver_lines(summary: Campaign) -> Iterator[str]:
     """Return the inputs that explain the error and the required metrics best, or that none explains them.
 
     An input is named if it explains a significant fraction of at least `statistics.EXPLAINS` of the variance.
@@ -122,28 +135,28 @@ def drivers(summary: Campaign) -> Iterator[str]:
         elif sensitivities:
             unexplained.append(metric)
     if unexplained:
-        least = f"{100 * statistics.EXPLAINS:g} % of the variance of the ranks"
-        yield f"no dispersed quantity alone explains {least} of {', '.join(unexplained)}"
+        threshold = f"{100 * statistics.EXPLAINS:g} % of the variance of the ranks"
+        yield f"no dispersed quantity alone explains {threshold} of {', '.join(unexplained)}"
 
 
-def gains(scenario: dict[str, Any], plant: str) -> Table:
+def gain_table(scenario: dict[str, Any], plant: str) -> Table:
     """Return the law, observer and filter of a scenario's tables with their gains; plant: its kind."""
     from ptsmc_jax.scenario import keys
     from ptsmc_jax.scenario.layouts import SCENARIOS
 
     rows: list[tuple[str, ...]] = []
     for table in ("controller", "observer", "filter", "sensors"):
-        given = scenario.get(table, {})
-        if isinstance(given, list):  # [[sensors]] have no gains
+        scenario_table = scenario.get(table, {})
+        if isinstance(scenario_table, list):  # [[sensors]] have no gains
             continue
-        custom = given.get("kind") == "custom"  # units are in its class, which is not run here
+        is_custom = scenario_table.get("kind") == "custom"  # units are in its class, which is not run here
         kinds: Any = SCENARIOS[plant].TABLES.get(table, {})
-        struct = kinds.get(given.get("kind"))
+        struct = kinds.get(scenario_table.get("kind"))
         units = {key.name: key.unit for key in keys.list_keys(struct, SCENARIOS[plant].unit_of_d)} if struct else {}
-        for key, value in given.items():
+        for key, value in scenario_table.items():
             numbers = value if isinstance(value, list) else [value]
-            each = [f"{one:.6g}" if isinstance(one, float | int) else str(one) for one in numbers]
-            text = f"{each[0]} each" if len(each) > 1 and len(set(each)) == 1 else ", ".join(each)
-            unit = "" if custom and key not in ("t_f", "delta") else (units.get(key) or "").replace("-", "")
+            texts = [f"{number:.6g}" if isinstance(number, float | int) else str(number) for number in numbers]
+            text = f"{texts[0]} each" if len(texts) > 1 and len(set(texts)) == 1 else ", ".join(texts)
+            unit = "" if is_custom and key not in ("t_f", "delta") else (units.get(key) or "").replace("-", "")
             rows.append((f"{table}.{key}", text, unit))
     return Table(("key", "value", "unit"), rows)

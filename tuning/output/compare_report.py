@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from ptsmc_jax.formulas import ARCSEC, pointing_angle
 from ptsmc_jax.simulation.catalogues import MARGINS
 from tuning.output import page_charts
-from tuning.output.formats import digits, failed, listed, many, over_bound, ratio
+from tuning.output.formats import failed_counts, format_count, format_number, format_ratio, list_counts, ratio_to_bound
 from tuning.output.report import Chart, Report, Section, Table, Text
-from tuning.output.run_report import warnings
+from tuning.output.run_report import warning_lines
 from tuning.output.summaries import Compare, Entry, Interval, Law, Number
 
 
@@ -20,7 +20,7 @@ class Value:
 
     name: str
     unit: str
-    of: Callable[[Law], Number]
+    read: Callable[[Law], Number]
     digits: str = ".3g"
     interval: Callable[[Law], Interval] = lambda law: None  # 95 % interval of the number
 
@@ -35,16 +35,16 @@ class Question:
     logarithmic: bool = True
     note: str = ""
     judged: bool = False  # the table has the requirements too
-    what: str = ""  # label of the chart's axis if it shows several values
+    axis_label: str = ""  # label of the chart's axis if it shows several values
     limit: str = ""  # metric whose limit the chart shows
 
 
-def _angle(error: Number) -> Number:
+def _error_angle(error: Number) -> Number:
     """Return a window error |v| as an angle [arcsec]."""
     return None if error is None else float(ARCSEC * pointing_angle(error))
 
 
-def _angles(bounds: Interval) -> Interval:
+def _error_angles(bounds: Interval) -> Interval:
     if bounds is None:
         return None
     low, high = (ARCSEC * pointing_angle(bounds)).tolist()
@@ -56,9 +56,9 @@ def _error_column(name: str, change: str) -> Value:
     return Value(
         name,
         "arcsec",
-        lambda law: _angle(law.model_errors[change].window_error) if change in law.model_errors else None,
+        lambda law: _error_angle(law.model_errors[change].window_error) if change in law.model_errors else None,
         interval=lambda law: (
-            _angles(law.model_errors[change].window_error_interval) if change in law.model_errors else None
+            _error_angles(law.model_errors[change].window_error_interval) if change in law.model_errors else None
         ),
     )
 
@@ -69,23 +69,23 @@ def _margin_column(name: str) -> Value:
     The margin is the worst of the dispersed loops if it is required, otherwise the margin of the nominal loop.
     """
 
-    def of(law: Law) -> Number:
-        verdict = next((one for one in law.verdicts if one.metric == name), None)
+    def read_margin(law: Law) -> Number:
+        verdict = next((entry for entry in law.verdicts if entry.metric == name), None)
         if verdict is not None:
             return math.inf if verdict.worst is None and not verdict.failures else verdict.worst
         if law.margins is None or "hold" not in law.margins:
             return None
-        left = law.margins["hold"].numbers[name]
-        return math.inf if left is None else left  # null means that the margin is unlimited
+        margin = law.margins["hold"].numbers[name]
+        return math.inf if margin is None else margin  # null means that the margin is unlimited
 
-    return Value(name.removesuffix("_margin").replace("_", " "), MARGINS[name].unit, of)
+    return Value(name.removesuffix("_margin").replace("_", " "), MARGINS[name].unit, read_margin)
 
 
 ERROR = Value(
-    "RMS pointing error", "arcsec", lambda law: _angle(law.window_error),
-    interval=lambda law: _angles(law.window_error_interval),
+    "RMS pointing error", "arcsec", lambda law: _error_angle(law.window_error),
+    interval=lambda law: _error_angles(law.window_error_interval),
 )  # fmt: skip
-BOUND = Value("ratio to the lower bound", "", lambda law: over_bound(law.window_error, law.lower_bound))
+BOUND = Value("ratio to the lower bound", "", lambda law: ratio_to_bound(law.window_error, law.lower_bound))
 CHANGES = {
     "heavier": "an inertia 10 % larger than the law knows",
     "lighter": "an inertia 10 % smaller than the law knows",
@@ -103,7 +103,7 @@ QUESTIONS = (
             Value("largest", "N m", lambda law: law.largest_peak_torque),
         ),
         2,
-        what="peak torque",
+        axis_label="peak torque",
         limit="peak_torque",
     ),
     Question("How much is spent?", (Value("mean effort", "N m s", lambda law: law.effort),), 1),
@@ -118,7 +118,7 @@ QUESTIONS = (
         ),
         3,
         logarithmic=False,
-        what="settling time",
+        axis_label="settling time",
         note="Medians over all trials, and over the fifths of the trials that start nearest to and farthest from the "
         "reference.",
     ),
@@ -141,7 +141,7 @@ QUESTIONS = (
             _error_column("a period later", "later"),
         ),
         4,
-        what="RMS pointing error",
+        axis_label="RMS pointing error",
         note="The same gains and trials, with another inertia or delay than the law knows. Bars are 95 % intervals.",
     ),
 )  # fmt: skip
@@ -154,57 +154,57 @@ def build(summary: Compare) -> Report:
         "not met": "The tuned law of the paper does NOT meet every requirement",
     }.get(summary.status, "Interrupted: the best result so far")
     sections = [
-        Section(question.title, [_chart(question, summary.laws, k), table(question, summary.laws)])
+        Section(question.title, [_draw_answers(question, summary.laws, k), answer_table(question, summary.laws)])
         for k, question in enumerate(QUESTIONS)
-        if any(value.of(law) is not None for value in question.values for law in summary.laws.values())
+        if any(value.read(law) is not None for value in question.values for law in summary.laws.values())
     ]
-    how = (
+    method = (
         "the same search tuned each law in all of its gains, the scenario's own law in those of tune.free; results on "
-        f"{many(summary.trials, 'held-out trial')}, {summary.judged_on}"
+        f"{format_count(summary.trials, 'held-out trial')}, {summary.judged_on}"
     )
-    sections.append(Section("Gains", [Text(list(lines(summary)))]))
+    sections.append(Section("Gains", [Text(list(gain_lines(summary)))]))
     mood = "good" if summary.status == "met" else "bad"
-    return Report(headline, mood, [winner(summary.laws), how, *warnings(summary.warnings)], sections)
+    return Report(headline, mood, [most_accurate_law(summary.laws), method, *warning_lines(summary.warnings)], sections)
 
 
-def _chart(question: Question, laws: dict[str, Law], k: int) -> Chart:
+def _draw_answers(question: Question, laws: dict[str, Law], number: int) -> Chart:
     shown = question.values[: question.drawn]
     series = {
-        value.name: ([value.of(law) for law in laws.values()], [value.interval(law) for law in laws.values()])
+        value.name: ([value.read(law) for law in laws.values()], [value.interval(law) for law in laws.values()])
         for value in shown
     }
-    axis = f"{question.what or shown[0].name} [{shown[0].unit}]"
-    names = [_name(law) for law in laws]
-    figure = page_charts.laws(names, series, axis, marks(question, list(laws.values())), question.logarithmic)
-    return Chart(f"question_{k}", figure, question.note)
+    axis = f"{question.axis_label or shown[0].name} [{shown[0].unit}]"
+    names = [_readable_name(law) for law in laws]
+    figure = page_charts.laws(names, series, axis, reference_lines(question, list(laws.values())), question.logarithmic)
+    return Chart(f"question_{number}", figure, question.note)
 
 
-def marks(question: Question, laws: list[Law]) -> dict[str, float]:
+def reference_lines(question: Question, laws: list[Law]) -> dict[str, float]:
     """Return the lines of a chart: the smallest lower bound of the laws, or a required limit."""
     if question.judged:
-        bounds = [bound for law in laws if (bound := _angle(law.lower_bound))]
+        bounds = [bound for law in laws if (bound := _error_angle(law.lower_bound))]
         return {"lower bound": min(bounds)} if bounds else {}
     limits = {verdict.metric: verdict.limit for law in laws for verdict in law.verdicts}
     return {"limit": limits[question.limit]} if question.limit in limits else {}
 
 
-def table(question: Question, laws: dict[str, Law]) -> Table:
+def answer_table(question: Question, laws: dict[str, Law]) -> Table:
     """Return the answers to a question, a law each row."""
-    columns = [value for value in question.values if any(value.of(law) is not None for law in laws.values())]
+    columns = [value for value in question.values if any(value.read(law) is not None for law in laws.values())]
     first = columns[0]
     head = [f"{value.name} [{value.unit}]" if value.unit else value.name for value in columns]
     with_interval = question.judged and any(first.interval(law) for law in laws.values())
     required = list(dict.fromkeys(verdict.metric for law in laws.values() for verdict in law.verdicts))
     rows = []
     for name, law in laws.items():
-        cells = [cell(value, law) for value in columns]
+        cells = [format_answer(value, law) for value in columns]
         if with_interval:
             bounds = first.interval(law)
-            cells.insert(1, "-" if bounds is None else f"{ratio(bounds[0])} to {ratio(bounds[1])}")
+            cells.insert(1, "-" if bounds is None else f"{format_ratio(bounds[0])} to {format_ratio(bounds[1])}")
         if question.judged:
-            beyond = {verdict.metric: _beyond(verdict) for verdict in law.verdicts}
-            cells += [*(beyond.get(metric, "-") for metric in required), "yes" if law.met else "no"]
-        rows.append((_name(name), *cells))
+            violations = {verdict.metric: _count_violations(verdict) for verdict in law.verdicts}
+            cells += [*(violations.get(metric, "-") for metric in required), "yes" if law.met else "no"]
+        rows.append((_readable_name(name), *cells))
     if with_interval:
         head.insert(1, "95 % interval")
     if question.judged:
@@ -212,24 +212,24 @@ def table(question: Question, laws: dict[str, Law]) -> Table:
     return Table(("", *head), rows)
 
 
-def _beyond(verdict: Entry) -> str:
+def _count_violations(verdict: Entry) -> str:
     return f"{verdict.failures} of {verdict.trials}" + ("" if verdict.met else ": NOT met")
 
 
-def cell(value: Value, law: Law) -> str:
+def format_answer(value: Value, law: Law) -> str:
     """Return the number of a law as text."""
-    number = value.of(law)
+    number = value.read(law)
     if number is not None and math.isinf(number):
         return "unlimited"
-    return ratio(number) if value.digits == ".3g" else digits(number, value.digits)
+    return format_ratio(number) if value.digits == ".3g" else format_number(number, value.digits)
 
 
-def lines(summary: Compare) -> Iterator[str]:
+def gain_lines(summary: Compare) -> Iterator[str]:
     """Return the gains of each law, its failed trials, and the limits that it breaks."""
     if summary.status == "interrupted":
         yield (
-            f"interrupted while {_name(list(summary.laws)[-1])} was tuned: its gains are the best so far, and the "
-            "other laws are missing; the same command resumes the search"
+            f"interrupted while {_readable_name(list(summary.laws)[-1])} was tuned: its gains are the best so far, and "
+            "the other laws are missing; the same command resumes the search"
         )
     if summary.published_unavailable:
         yield f"the published gains cannot be simulated in this scenario: {summary.published_unavailable}"
@@ -241,10 +241,10 @@ def lines(summary: Compare) -> Iterator[str]:
             if (name, summary.published_label) == ("published", "published, scaled")
             else ""
         )
-        yield f"{_name(name)}{scaled}: {gains}{bound}"
-        failures = failed(law.counts)
+        yield f"{_readable_name(name)}{scaled}: {gains}{bound}"
+        failures = failed_counts(law.counts)
         if failures:
-            yield f"  {sum(failures.values())} of {summary.trials} trials fail: {listed(failures)}"
+            yield f"  {sum(failures.values())} of {summary.trials} trials fail: {list_counts(failures)}"
         yield from (f"  {verdict}" for verdict in law.verdicts if not verdict.met)
         for change, results in law.model_errors.items():
             if results.failures:
@@ -252,21 +252,25 @@ def lines(summary: Compare) -> Iterator[str]:
     yield f"a trial has settled when its angle stays below {summary.settling_angle:g} rad"
 
 
-def winner(laws: dict[str, Law]) -> str:
+def most_accurate_law(laws: dict[str, Law]) -> str:
     """Return the most accurate law that meets every requirement, and the ratio of the paper's law to it."""
-    errors = {name: error for name, law in laws.items() if law.met and (error := _angle(law.window_error)) is not None}
+    errors = {
+        name: error for name, law in laws.items() if law.met and (error := _error_angle(law.window_error)) is not None
+    }
     if not errors:
         return "no law meets every requirement"
-    best, ours = min(errors, key=errors.__getitem__), "prescribed_time"
-    behind = ""
-    if ours in errors and best != ours:
-        theirs = f"{errors[ours] / errors[best]:.3g} times as much" if errors[best] else f"{errors[ours]:.3g} arcsec"
-        behind = f"; {_name(ours)} has {theirs}"
+    best, own_law = min(errors, key=errors.__getitem__), "prescribed_time"
+    comparison = ""
+    if own_law in errors and best != own_law:
+        own_error = (
+            f"{errors[own_law] / errors[best]:.3g} times as much" if errors[best] else f"{errors[own_law]:.3g} arcsec"
+        )
+        comparison = f"; {_readable_name(own_law)} has {own_error}"
     return (
-        f"{_name(best)} has the smallest RMS pointing error of the laws that meet every requirement, "
-        f"{errors[best]:.3g} arcsec{behind}"
+        f"{_readable_name(best)} has the smallest RMS pointing error of the laws that meet every requirement, "
+        f"{errors[best]:.3g} arcsec{comparison}"
     )
 
 
-def _name(law: str) -> str:
+def _readable_name(law: str) -> str:
     return "published gains" if law == "published" else law.replace("_", " ")

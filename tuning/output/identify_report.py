@@ -1,6 +1,6 @@
 """The report of an identification."""
 
-from tuning.output.formats import digits
+from tuning.output.formats import format_number
 from tuning.output.report import Report, Section, Table
 from tuning.output.summaries import Designed, Identified, LogFit
 
@@ -10,17 +10,17 @@ autocorrelation."""
 
 def build(summary: Identified) -> Report:
     """Return the report of `ptsmc identify`."""
-    good = summary.status == "identified"
-    headline = "The model explains the telemetry" if good else "The model is DOUBTFUL"
-    sections = [Section("Estimates", [estimates(summary)]), Section("Logs", [logs(summary)])]
-    return Report(headline, "good" if good else "bad", summary.verdict, sections)
+    is_identified = summary.status == "identified"
+    headline = "The model explains the telemetry" if is_identified else "The model is DOUBTFUL"
+    sections = [Section("Estimates", [estimate_table(summary)]), Section("Logs", [log_table(summary)])]
+    return Report(headline, "good" if is_identified else "bad", summary.verdict, sections)
 
 
-def estimates(summary: Identified) -> Table:
+def estimate_table(summary: Identified) -> Table:
     """Return the table of the estimated numbers."""
     rows = [
         (one.parameter, f"{one.estimate:.6g}", f"{one.std:.2g}", f"{one.lower:.5g} to {one.upper:.5g}",
-         f"{one.start:.6g}", digits(one.prior_std, ".2g", "none"), one.unit or "-")
+         f"{one.start:.6g}", format_number(one.prior_std, ".2g", "none"), one.unit or "-")
         for one in summary.parameters
     ]  # fmt: skip
     for bias in summary.gyro_bias:
@@ -32,26 +32,28 @@ def estimates(summary: Identified) -> Table:
     return Table(head, rows)
 
 
-def logs(summary: Identified) -> Table:
+def log_table(summary: Identified) -> Table:
     """Return the table of the logs and of their prediction errors."""
 
-    def row(one: LogFit, use: str) -> tuple[str, ...]:
-        largest = max((abs(value or 0.0) for value in one.largest_autocorrelation.values()), default=0.0)
+    def log_row(fit: LogFit, use: str) -> tuple[str, ...]:
+        largest = max((abs(value or 0.0) for value in fit.largest_autocorrelation.values()), default=0.0)
         numbers = (
-            f"{one.duration:.4g}",
-            str(one.readings),
-            str(one.outliers),
-            f"{one.mean_square:.4g}",
+            f"{fit.duration:.4g}",
+            str(fit.readings),
+            str(fit.outliers),
+            f"{fit.mean_square:.4g}",
             f"{largest:.2g}",
         )
-        return one.log, use, *numbers, "yes" if one.white else "NO"
+        return fit.log, use, *numbers, "yes" if fit.white else "NO"
 
-    rows = [row(one, "estimation") for one in summary.logs] + [row(one, "validation") for one in summary.validation]
+    rows = [log_row(one, "estimation") for one in summary.logs] + [
+        log_row(one, "validation") for one in summary.validation
+    ]
     head = ("log", "use", "duration [s]", "readings", "outliers", "mean square", "autocorrelation", "white")
     return Table(head, rows, NOTE)
 
 
-def of_design(summary: Designed) -> Report:
+def build_design(summary: Designed) -> Report:
     """Return the report of `ptsmc identify --design`."""
     rows = [
         (

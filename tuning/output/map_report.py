@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from tuning.output.formats import digits, error, number, valued, with_unit
+from tuning.output.formats import add_unit, format_error, format_metric, format_number, parse_cell
 from tuning.output.report import Report, Section, Table
 
 NOTE = (
@@ -16,14 +16,14 @@ NOTE = (
 
 def build(head: Sequence[str], rows: Sequence[Sequence[str]], plant: str) -> Report:
     """Return the report of a map.csv for this kind of plant; the first two columns are the keys."""
-    pairs = [dict(zip(("x", "y", *head[2:]), map(number, row), strict=True)) for row in rows]
-    first, *others = lines(pairs, (head[0], head[1]), plant)
-    cells = [tuple(_short(cell) for cell in row) for row in rows]
-    table = Table(tuple(with_unit(name, plant) for name in head), cells, NOTE)
-    return Report(first[0].upper() + first[1:], "calm", others, [Section("Pairs", [table])])
+    pairs = [dict(zip(("x", "y", *head[2:]), map(parse_cell, row), strict=True)) for row in rows]
+    headline, *lines = summary_lines(pairs, (head[0], head[1]), plant)
+    cells = [tuple(_shorten_cell(cell) for cell in row) for row in rows]
+    table = Table(tuple(add_unit(name, plant) for name in head), cells, NOTE)
+    return Report(headline[0].upper() + headline[1:], "calm", lines, [Section("Pairs", [table])])
 
 
-def lines(pairs: Sequence[Mapping[str, Any]], keys: tuple[str, str], plant: str) -> Iterator[str]:
+def summary_lines(pairs: Sequence[Mapping[str, Any]], keys: tuple[str, str], plant: str) -> Iterator[str]:
     """Return the best pair and the number of pairs that were simulated.
 
     Args:
@@ -34,25 +34,29 @@ def lines(pairs: Sequence[Mapping[str, Any]], keys: tuple[str, str], plant: str)
     simulated = [pair for pair in pairs if pair["status"] == "simulated"]
     with_error = [pair for pair in simulated if pair["window_error"] == pair["window_error"]]  # is not NaN
     if with_error:
-        best = min(with_error, key=lambda pair: (_failed(pair), pair["window_error"]))
-        failed = f"; {_failed(best):.0f} of its trials failed or did not converge at t_f" if _failed(best) else ""
-        peak = valued(best["peak_torque"], "peak_torque", plant)
+        best = min(with_error, key=lambda pair: (_count_failures(pair), pair["window_error"]))
+        failed = (
+            f"; {_count_failures(best):.0f} of its trials failed or did not converge at t_f"
+            if _count_failures(best)
+            else ""
+        )
+        peak = format_metric(best["peak_torque"], "peak_torque", plant)
         yield (
-            f"the smallest RMS error is {error(best['window_error'], plant)} at {keys[0]} = {best['x']:.4g} and "
+            f"the smallest RMS error is {format_error(best['window_error'], plant)} at {keys[0]} = {best['x']:.4g} and "
             f"{keys[1]} = {best['y']:.4g}, with a mean peak torque of {peak}{failed}"
         )
-    failed = sum(_failed(pair) > 0 for pair in simulated)
+    failed = sum(_count_failures(pair) > 0 for pair in simulated)
     yield (
         f"{len(simulated)} of {len(pairs)} pairs simulated, {failed} of them with trials that failed or "
         "did not converge at t_f"
     )
 
 
-def _failed(pair: Mapping[str, Any]) -> float:
+def _count_failures(pair: Mapping[str, Any]) -> float:
     """Return the number of trials of a pair that failed or did not converge at t_f."""
     return pair["failures"] + pair["not_converged"]
 
 
-def _short(cell: str) -> str:
-    value = number(cell)
-    return cell if isinstance(value, str) or not cell else digits(value, ".4g", "")
+def _shorten_cell(cell: str) -> str:
+    value = parse_cell(cell)
+    return cell if isinstance(value, str) or not cell else format_number(value, ".4g", "")

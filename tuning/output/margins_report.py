@@ -3,11 +3,11 @@
 from collections.abc import Iterator, Mapping
 
 from ptsmc_jax.simulation.catalogues import MARGINS
-from tuning.output.formats import digits
+from tuning.output.formats import format_number
 from tuning.output.report import Report, Section, Table
 from tuning.output.summaries import Left, LimitCycle, Margins, Numbers
 
-ENOUGH = {"gain_margin": 6.0, "phase_margin": 30.0}  # usual requirements [dB, deg]
+USUAL_MARGINS = {"gain_margin": 6.0, "phase_margin": 30.0}  # usual requirements [dB, deg]
 PHASES = {"hold": "hold phase", "before": "approach phase"}
 COLUMNS = {
     "gain_up": "gain up",
@@ -26,31 +26,33 @@ def build(summary: Margins) -> Report:
     elif not summary.stable:
         headline, mood = "The nominal loop is NOT stable in the hold phase", "bad"
     elif unstable:
-        worst = limited_margins(summary.worst)
+        worst = format_margins(summary.worst)
         headline, mood = f"Stable in the hold phase, NOT stable in the approach phase: {worst}", "bad"
     else:
-        headline, mood = f"The nominal loop is stable: {limited_margins(summary.worst)}", "calm"
-    return Report(headline, mood, list(_lines(summary)), [Section("Margins in the hold phase", [table(summary)])])
+        headline, mood = f"The nominal loop is stable: {format_margins(summary.worst)}", "calm"
+    return Report(
+        headline, mood, list(_condition_lines(summary)), [Section("Margins in the hold phase", [margin_table(summary)])]
+    )
 
 
-def table(summary: Margins) -> Table:
+def margin_table(summary: Margins) -> Table:
     """Return the margins in the hold phase at each input alone, at all inputs, and at each measured state."""
 
-    def row(where: str, margins: Numbers, none: str = "none") -> tuple[str, ...]:
-        return where, *(digits(margins[name], ".3g", none) if name in margins else "-" for name in COLUMNS)
+    def margin_row(where: str, margins: Numbers, unlimited: str = "none") -> tuple[str, ...]:
+        return where, *(format_number(margins[name], ".3g", unlimited) if name in margins else "-" for name in COLUMNS)
 
-    rows = [row(f"input {name}", margins) for name, margins in summary.hold.items()]
-    rows.append(row("all inputs", summary.together, "none" if summary.stable else "-"))
-    rows += [row(name, margins) for name, margins in summary.sensors.items()]
+    rows = [margin_row(f"input {name}", margins) for name, margins in summary.hold.items()]
+    rows.append(margin_row("all inputs", summary.together, "none" if summary.stable else "-"))
+    rows += [margin_row(name, margins) for name, margins in summary.sensors.items()]
     return Table(("loop opened at", *COLUMNS.values()), rows, "none: the margin is unlimited.")
 
 
-def _lines(summary: Margins) -> Iterator[str]:
+def _condition_lines(summary: Margins) -> Iterator[str]:
     """Return the conditions under which the margins hold, and warnings."""
     if summary.stable and not summary.open:
         yield "these are the smallest margins at any input, in the hold phase and the frozen approach phase"
     if summary.limit_cycle is not None:
-        yield from oscillation(summary.limit_cycle)
+        yield from limit_cycle_lines(summary.limit_cycle)
     if summary.start_deg is not None:
         yield f"the nominal run starts {summary.start_deg:.4g} deg from the reference; change [initial] for another"
     if summary.not_converged:
@@ -65,29 +67,29 @@ def _lines(summary: Margins) -> Iterator[str]:
     ):  # fmt: skip
         times = sorted(loop.time_to_go for loop in summary.before if not loop.stable and loop.judged == judged)
         if times:
-            yield f"in the approach phase, the loop with frozen gains is unstable at {_span(times)}{caveat}"
-    yield from _openings(summary)
+            yield f"in the approach phase, the loop with frozen gains is unstable at {_format_times(times)}{caveat}"
+    yield from _open_loop_lines(summary)
     if summary.note:
         yield summary.note
 
 
-def _openings(summary: Margins) -> Iterator[str]:
+def _open_loop_lines(summary: Margins) -> Iterator[str]:
     """Return the inputs at which the loop is open, and the reason."""
     for by_limit, reason in (
         (True, "a limit of the actuators cuts the command of the nominal run"),
         (False, "the controller does not react to the state at this sample"),
     ):
 
-        def opened(names: list[str], cut: list[str], by_limit: bool = by_limit) -> list[str]:
+        def select_inputs(names: list[str], cut: list[str], by_limit: bool = by_limit) -> list[str]:
             return [name for name in names if (name in cut) == by_limit]
 
-        inputs = opened(summary.open, summary.cut)
+        inputs = select_inputs(summary.open, summary.cut)
         places = {"in the hold phase": inputs}
-        loops = {loop.time_to_go: opened(loop.open, loop.cut) for loop in summary.before}
+        loops = {loop.time_to_go: select_inputs(loop.open, loop.cut) for loop in summary.before}
         times = sorted(time for time, names in loops.items() if names)
         if times:
             inputs = list(dict.fromkeys(name for names in loops.values() for name in names))
-            places[f"in the approach phase, at {_span(times)}"] = inputs
+            places[f"in the approach phase, at {_format_times(times)}"] = inputs
         for where, names in places.items():
             if names:
                 yield (
@@ -96,47 +98,47 @@ def _openings(summary: Margins) -> Iterator[str]:
                 )
 
 
-def _span(times: list[float]) -> str:
+def _format_times(times: list[float]) -> str:
     """Return times to go [s], in ascending order, as text."""
     span = f"{times[0]:.3g}" if len(times) == 1 else f"{len(times)} samples from {times[0]:.3g} to {times[-1]:.3g}"
     return f"{span} s to go"
 
 
-def tuned(margins: Mapping[str, Left] | None, *, required: bool) -> Iterator[str]:
+def tuned_margin_lines(margins: Mapping[str, Left] | None, *, required: bool) -> Iterator[str]:
     """Return the margins of tuned gains, and a warning if they are smaller than usual.
 
     Args:
-        margins: the smallest of each phase, see `stability.worst`.
+        margins: the smallest of each phase, see `stability.worst_margins`.
         required: a margin is among the requirements.
     """
-    short = False
-    for where, phase in PHASES.items():
-        left = (margins or {}).get(where)
-        if left is None:
+    is_insufficient = False
+    for phase_key, phase in PHASES.items():
+        smallest = (margins or {}).get(phase_key)
+        if smallest is None:
             continue
-        if left.limit_cycle is not None or not left.stable:
-            short = True
+        if smallest.limit_cycle is not None or not smallest.stable:
+            is_insufficient = True
             yield from (
-                oscillation(left.limit_cycle)
-                if left.limit_cycle
+                limit_cycle_lines(smallest.limit_cycle)
+                if smallest.limit_cycle
                 else [f"the nominal loop is NOT stable in the {phase}"]
             )
             continue
-        yield f"margins of the nominal loop in the {phase}: {limited_margins(left.numbers)}"
-        few = [
-            f"{enough:g} {MARGINS[name].unit} of {_short(name)}"
-            for name, enough in ENOUGH.items()
-            if (value := left.numbers[name]) is not None and value < enough
+        yield f"margins of the nominal loop in the {phase}: {format_margins(smallest.numbers)}"
+        missed = [
+            f"{usual:g} {MARGINS[name].unit} of {_short_name(name)}"
+            for name, usual in USUAL_MARGINS.items()
+            if (value := smallest.numbers[name]) is not None and value < usual
         ]
-        if few:
-            short = True
-            yield f"less than {' and '.join(few)} in the {phase}: errors of the model may make the loop unstable"
-    if short and not required:
-        more = " and ".join(f"requirements.{name} = {enough:g}" for name, enough in ENOUGH.items())
-        yield f"for larger margins, tune with {more}; ptsmc pareto --against margins shows their cost"
+        if missed:
+            is_insufficient = True
+            yield f"less than {' and '.join(missed)} in the {phase}: errors of the model may make the loop unstable"
+    if is_insufficient and not required:
+        advice = " and ".join(f"requirements.{name} = {usual:g}" for name, usual in USUAL_MARGINS.items())
+        yield f"for larger margins, tune with {advice}; ptsmc pareto --against margins shows their cost"
 
 
-def oscillation(limit_cycle: LimitCycle) -> Iterator[str]:
+def limit_cycle_lines(limit_cycle: LimitCycle) -> Iterator[str]:
     """Return the description of a limit cycle in the hold phase."""
     yield "the nominal run does NOT come to rest in the hold phase, so its margins count as zero"
     yield (
@@ -146,13 +148,13 @@ def oscillation(limit_cycle: LimitCycle) -> Iterator[str]:
     )
 
 
-def limited_margins(margins: Numbers) -> str:
+def format_margins(margins: Numbers) -> str:
     """Return a text with those margins that a scenario can require, `MARGINS`."""
     limited = {name: margins.get(name) for name in MARGINS}
     return ", ".join(
-        f"{_short(name)} {value:.3g} {MARGINS[name].unit}" for name, value in limited.items() if value is not None
+        f"{_short_name(name)} {value:.3g} {MARGINS[name].unit}" for name, value in limited.items() if value is not None
     )
 
 
-def _short(name: str) -> str:
+def _short_name(name: str) -> str:
     return "max |S|" if name == "peak_sensitivity" else name.removesuffix("_margin")

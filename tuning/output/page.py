@@ -40,8 +40,8 @@ from tuning.output.report import Chart, Code, Picture, Report, Section, Table
 from tuning.studies import front
 
 HERE = Path(__file__).parent
-FILES = ("versions.json", store.SUMMARY, "scenario.toml", "trajectory.csv", "history.csv", "map.csv")  # to read
-PNG = b"\x89PNG\r\n\x1a\n"  # first bytes of a PNG file
+INPUT_FILES = ("versions.json", store.SUMMARY, "scenario.toml", "trajectory.csv", "history.csv", "map.csv")  # to read
+PNG_HEADER = b"\x89PNG\r\n\x1a\n"  # first bytes of a PNG file
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,8 @@ def read(folder: Path) -> Result:
     """Read a result folder. Raises RefusedError if it holds no finished result."""
     if not folder.is_dir():
         raise RefusedError(f"{folder} is no folder; allowed is a folder that a ptsmc command wrote")
-    for name in FILES:
-        if _leads_out(folder, folder / name):
+    for name in INPUT_FILES:
+        if _is_outside(folder, folder / name):
             raise RefusedError(f"{folder / name} is a link out of the folder; allowed is a file in it")
     versions = store.read_versions(folder)
     command = versions.get("command")
@@ -78,21 +78,21 @@ def read(folder: Path) -> Result:
     try:
         summary = json.loads((folder / store.SUMMARY).read_text(encoding="utf-8")) if command != "map" else {}
         path = folder / "scenario.toml"
-        scenario = parsing.toml(path.read_text(encoding="utf-8"), str(path)) if path.exists() else {}
+        scenario = parsing.parse_toml(path.read_text(encoding="utf-8"), str(path)) if path.exists() else {}
     except FileNotFoundError:
-        raise _unfinished(folder, versions) from None
+        raise _unfinished_error(folder, versions) from None
     except (ValueError, RecursionError) as error:
         raise RefusedError(f"{folder} holds a file that cannot be read: {error}") from None
     return Result(folder, versions, summary, scenario)
 
 
-def _leads_out(folder: Path, path: Path) -> bool:
+def _is_outside(folder: Path, path: Path) -> bool:
     """Return whether a path of a result folder is, or lies behind, a link to a place outside the folder."""
     # unlike Path.resolve it does not raise for a link to itself
     return not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
 
 
-def _unfinished(folder: Path, versions: dict[str, Any]) -> RefusedError:
+def _unfinished_error(folder: Path, versions: dict[str, Any]) -> RefusedError:
     unfinished = f"{folder} holds a {versions['command']} that is not finished"
     return RefusedError(f"{unfinished}; run the same command to its end")
 
@@ -114,19 +114,25 @@ def build(folder: Path) -> str:
     try:
         report = REPORTS[result.versions["command"]](result)
     except FileNotFoundError:
-        raise _unfinished(folder, result.versions) from None
+        raise _unfinished_error(folder, result.versions) from None
     except (msgspec.ValidationError, KeyError, AttributeError, TypeError) as error:
-        by = result.versions.get("ptsmc-jax")
-        raise RefusedError(f"{folder} holds a summary of another version ({by}): {error}; make it again") from None
+        version = result.versions.get("ptsmc-jax")
+        raise RefusedError(f"{folder} holds a summary of another version ({version}): {error}; make it again") from None
     except (csv.Error, IndexError, ValueError) as error:  # such as a table that is cut off
         raise RefusedError(f"{folder} holds a file that cannot be read: {error}") from None
-    sections = [*report.sections, *_pictures(result), *_origin(result)]
-    drawn = {block.name: block.figure for section in sections for block in section.blocks if isinstance(block, Chart)}
-    drawing = (HERE / "page.js").read_text(encoding="utf-8")
-    library = get_plotlyjs() if drawn else ""
-    scripts = " ".join(f"'sha256-{_checksum(script)}'" for script in (library, drawing)) if drawn else "'none'"
+    sections = [*report.sections, *_figure_sections(result), *_origin_sections(result)]
+    charts_by_name = {
+        block.name: block.figure for section in sections for block in section.blocks if isinstance(block, Chart)
+    }
+    drawing_script = (HERE / "page.js").read_text(encoding="utf-8")
+    library = get_plotlyjs() if charts_by_name else ""
+    scripts = (
+        " ".join(f"'sha256-{_checksum(script)}'" for script in (library, drawing_script))
+        if charts_by_name
+        else "'none'"
+    )
     # no < in the data: nothing in it can end its element
-    charts = json.dumps(drawn, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    charts = json.dumps(charts_by_name, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string((HERE / "page.html").read_text(encoding="utf-8"))
     return template.render(
@@ -135,9 +141,9 @@ def build(folder: Path) -> str:
         sections=sections,
         policy=Markup(f"default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; script-src {scripts}"),
         style=Markup((HERE / "page.css").read_text(encoding="utf-8")),
-        charts=Markup(charts) if drawn else "",
+        charts=Markup(charts) if charts_by_name else "",
         library=Markup(library),
-        drawing=Markup(drawing),
+        drawing=Markup(drawing_script),
     )
 
 
@@ -145,13 +151,13 @@ def _checksum(script: str) -> str:
     return base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii")
 
 
-def _with(report: Report, *sections: Section) -> Report:
+def _add_sections(report: Report, *sections: Section) -> Report:
     """Return a report with further sections."""
     return replace(report, sections=[*report.sections, *sections])
 
 
-def _simulate(result: Result) -> Report:
-    columns = page_charts.read(result.folder / "trajectory.csv")
+def _simulate_report(result: Result) -> Report:
+    columns = page_charts.read_trajectory(result.folder / "trajectory.csv")
     law = result.scenario["controller"]
     marks = {"t_f": law["t_f"], **({"t_f - delta": law["t_f"] - law["delta"]} if "delta" in law else {})}
     if "delta" in law and law["delta"] < 0.05 * columns["t"][-1]:  # the labels would overlap
@@ -164,68 +170,68 @@ def _simulate(result: Result) -> Report:
         caption = "The body and its axes over time; dashed: the inertial axes. Drag to turn the view."
         charts.append(Chart("attitude", page_charts.attitude(columns["t"], q), caption, "square"))
     report = run_report.build(summaries.run(result.summary, result.plant), result.plant)
-    return _with(report, Section("History", [*charts]))
+    return _add_sections(report, Section("History", [*charts]))
 
 
-def _tune(result: Result) -> Report:
+def _tune_report(result: Result) -> Report:
     head, *rows = result.rows("history.csv")
     points = [dict(zip(head, row, strict=True)) for row in rows]
     caption = "The objective along the local search from each starting point; a hollow point breaks a limit."
     chart = Chart("search", page_charts.search(points, head[2]), caption)
-    return _with(tune_report.build(summaries.tune(result.summary)), Section("Search", [chart]))
+    return _add_sections(tune_report.build(summaries.tune(result.summary)), Section("Search", [chart]))
 
 
-def _pareto(result: Result) -> Report:
-    found = front.read(result.summary)
-    report = front_report.build(found)
-    if found.against != "torque":
+def _pareto_report(result: Result) -> Report:
+    pareto = front.read(result.summary)
+    report = front_report.build(pareto)
+    if pareto.against != "torque":
         return report
     caption = "Hover over a point for its gains. Bars are 95 % intervals; the dashed line is the required limit."
     requirement = result.scenario.get("requirements", {}).get("peak_torque")
     limit = requirement.get("limit") if isinstance(requirement, dict) else requirement
     (section,) = report.sections
-    chart = Chart("front", page_charts.front(found, limit), caption)
+    chart = Chart("front", page_charts.front(pareto, limit), caption)
     return replace(report, sections=[replace(section, blocks=[chart, *section.blocks])])
 
 
-def _montecarlo(result: Result) -> Report:
+def _montecarlo_report(result: Result) -> Report:
     report = campaign_report.build(summaries.read(summaries.Campaign, result.summary))
-    return _with(report, Section("Gains", [campaign_report.gains(result.scenario, result.plant)]))
+    return _add_sections(report, Section("Gains", [campaign_report.gain_table(result.scenario, result.plant)]))
 
 
-def _identify(result: Result) -> Report:
+def _identify_report(result: Result) -> Report:
     if result.summary.get("status") == "designed":
-        return identify_report.of_design(summaries.read(summaries.Designed, result.summary))
+        return identify_report.build_design(summaries.read(summaries.Designed, result.summary))
     return identify_report.build(summaries.read(summaries.Identified, result.summary))
 
 
-def _map(result: Result) -> Report:
+def _map_report(result: Result) -> Report:
     head, *rows = result.rows("map.csv")
     return map_report.build(head, rows, result.plant)
 
 
 REPORTS: dict[str, Callable[[Result], Report]] = {
-    "simulate": _simulate,
-    "tune": _tune,
-    "pareto": _pareto,
+    "simulate": _simulate_report,
+    "tune": _tune_report,
+    "pareto": _pareto_report,
     "compare": lambda result: compare_report.build(summaries.read(summaries.Compare, result.summary)),
-    "montecarlo": _montecarlo,
-    "map": _map,
-    "identify": _identify,
+    "montecarlo": _montecarlo_report,
+    "map": _map_report,
+    "identify": _identify_report,
     "margins": lambda result: margins_report.build(summaries.read(summaries.Margins, result.summary)),
     "reproduce": lambda result: paper_report.build(summaries.read(summaries.Paper, result.summary)),
 }
 
 
-def _pictures(result: Result) -> Iterator[Section]:
+def _figure_sections(result: Result) -> Iterator[Section]:
     """Return the section of the figures in the folder."""
     pictures = []
     for path in sorted((result.folder / "figures").glob("*.png")):
-        out = _leads_out(result.folder, path)
-        content = path.read_bytes() if path.is_file() and not out else b""
-        if not content.startswith(PNG):
-            why = "is a link out of the folder" if out else "is no PNG file"
-            print(f"ptsmc: {path} {why}, and is not in the page", file=sys.stderr)
+        is_outside = _is_outside(result.folder, path)
+        content = path.read_bytes() if path.is_file() and not is_outside else b""
+        if not content.startswith(PNG_HEADER):
+            reason = "is a link out of the folder" if is_outside else "is no PNG file"
+            print(f"ptsmc: {path} {reason}, and is not in the page", file=sys.stderr)
             continue
         source = "data:image/png;base64," + base64.b64encode(content).decode("ascii")
         pictures.append(Picture(path.stem.replace("_", " "), source, page_captions.CAPTIONS.get(path.stem, "")))
@@ -233,14 +239,14 @@ def _pictures(result: Result) -> Iterator[Section]:
         yield Section("Figures", pictures)
 
 
-def _origin(result: Result) -> Iterator[Section]:
+def _origin_sections(result: Result) -> Iterator[Section]:
     """Return the scenario, the command line, and the versions."""
     versions = result.versions
     path = result.folder / "scenario.toml"
     if path.exists():
         note = page_captions.SCENARIO.get(versions["command"], "")
         yield Section("Scenario", [Code(path.read_text(encoding="utf-8"), note)])
-    call = versions.get(store.COMMAND_LINE, "")
-    yield Section("How to make this again", [Code(call, "In the folder where it was called.")])
+    command_line = versions.get(store.COMMAND_LINE, "")
+    yield Section("How to make this again", [Code(command_line, "In the folder where it was called.")])
     rows = [(name, json.dumps(value) if not isinstance(value, str) else value) for name, value in versions.items()]
     yield Section("Made by", [Table(("", "version"), rows)])

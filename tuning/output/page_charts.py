@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ptsmc_jax.figures import animation
-from ptsmc_jax.figures.style import STYLES, shown_error
+from ptsmc_jax.figures.style import STYLES, error_display
 from tuning.studies.front import Front, Point, unit_of
 
 Chart = dict[str, Any]
@@ -37,7 +37,7 @@ def _layout(**others: Any) -> Chart:
     }
 
 
-def read(path: Path) -> dict[str, np.ndarray]:
+def read_trajectory(path: Path) -> dict[str, np.ndarray]:
     """Return the numbers of a `trajectory.csv` by the names of its columns, (time,) each."""
     with path.open(newline="", encoding="utf-8") as file:
         head, *rows = csv.reader(file)
@@ -45,7 +45,7 @@ def read(path: Path) -> dict[str, np.ndarray]:
     return dict(zip(head, values.T, strict=True))
 
 
-LOGGED = ("measured", "sent")  # columns for `ptsmc identify`, which have gaps
+LOG_COLUMNS = ("measured", "sent")  # columns for `ptsmc identify`, which have gaps
 
 
 def history(columns: Mapping[str, np.ndarray], spacecraft: bool, marks: Mapping[str, float]) -> Chart:
@@ -57,56 +57,56 @@ def history(columns: Mapping[str, np.ndarray], spacecraft: bool, marks: Mapping[
         marks: times of vertical lines [s], by their labels.
     """
     t = columns["t"]
-    kept = np.unique(np.linspace(0, t.size - 1, min(POINTS, t.size)).round().astype(int))
+    samples = np.unique(np.linspace(0, t.size - 1, min(POINTS, t.size)).round().astype(int))
     blocks: dict[str, list[str]] = {}
     for name in columns:
-        if name != "t" and not name.startswith(LOGGED):
+        if name != "t" and not name.startswith(LOG_COLUMNS):
             blocks.setdefault(name.rstrip("0123456789"), []).append(name)
     above = {"yref": "paper", "yanchor": "bottom", "showarrow": False}
-    notes = [{**above, "x": at, "y": 1.0, "text": what} for what, at in marks.items()]
+    annotations = [{**above, "x": time_of_mark, "y": 1.0, "text": what} for what, time_of_mark in marks.items()]
     data, axes = [], {}
     for row, (block, names) in enumerate(blocks.items()):
         number = "" if row == 0 else str(row + 1)
         for k, name in enumerate(names):
             data.append({
                 "type": "scatter", "mode": "lines", "name": name, "yaxis": f"y{number}", "showlegend": False,
-                "x": numbers(t[kept]), "y": numbers(columns[name][kept]),
+                "x": to_json_numbers(t[samples]), "y": to_json_numbers(columns[name][samples]),
                 "hovertemplate": f"{name} %{{y:.5g}} at %{{x:.4g}} s<extra></extra>",
                 "line": {"color": COLOURS[k % len(COLOURS)], "dash": DASHES[k % len(DASHES)], "width": 1.6},
             })  # fmt: skip
         what, unit = PANELS.get(block, (block, "")) if spacecraft else (block, "")
         top = 1.0 - (row + 0.18) / len(blocks)
-        place = [1.0 - (row + 0.94) / len(blocks), top]
-        axes[f"yaxis{number}"] = {"domain": place, "exponentformat": "e"}
+        domain = [1.0 - (row + 0.94) / len(blocks), top]
+        axes[f"yaxis{number}"] = {"domain": domain, "exponentformat": "e"}
         text = f"{what} [{unit}]: {', '.join(names)}" if unit else ", ".join(names)
-        notes.append({**above, "x": 0.0, "xref": "paper", "xanchor": "left", "y": top, "text": text})
-    shapes = [_upright(at, color="#777", dash="dot", width=1) for at in marks.values()]
+        annotations.append({**above, "x": 0.0, "xref": "paper", "xanchor": "left", "y": top, "text": text})
+    shapes = [_vertical_line(time_of_mark, color="#777", dash="dot", width=1) for time_of_mark in marks.values()]
     time = {"title": {"text": "time [s]"}, "anchor": "y" if len(blocks) == 1 else f"y{len(blocks)}"}
-    return {"data": data, "layout": _layout(**axes, xaxis=time, shapes=shapes, annotations=notes)}
+    return {"data": data, "layout": _layout(**axes, xaxis=time, shapes=shapes, annotations=annotations)}
 
 
-def _upright(at: float, **line: Any) -> Chart:
+def _vertical_line(x: float, **line: Any) -> Chart:
     """Return a vertical line over the whole height of a chart; line: its style."""
-    return {"type": "line", "x0": at, "x1": at, "yref": "paper", "y0": 0, "y1": 1, "line": line}
+    return {"type": "line", "x0": x, "x1": x, "yref": "paper", "y0": 0, "y1": 1, "line": line}
 
 
 def attitude(t: np.ndarray, q: np.ndarray) -> Chart:
     """Return an animation of the body as a box with axes, from its quaternions q (time, 4), scalar last."""
-    shown = np.unique(np.searchsorted(t, np.linspace(t[0], t[-1], FRAMES) * (1.0 - 1e-12)))
+    samples = np.unique(np.searchsorted(t, np.linspace(t[0], t[-1], FRAMES) * (1.0 - 1e-12)))
 
-    def lines(at: np.ndarray) -> list[Chart]:
-        edges, axes = animation.body(at)
+    def body_lines(quaternion: np.ndarray) -> list[Chart]:
+        edges, axes = animation.body_edges_and_axes(quaternion)
         box = np.pad(edges, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan).reshape(-1, 3)  # a gap after each edge
         return [
-            _line(box, "body", "#888", 3),
-            *(_line(axis, f"body axis {k + 1}", COLOURS[k], 7) for k, axis in enumerate(axes)),
+            _line_3d(box, "body", "#888", 3),
+            *(_line_3d(axis, f"body axis {k + 1}", COLOURS[k], 7) for k, axis in enumerate(axes)),
         ]
 
-    fixed = [
-        _line(np.stack([np.zeros(3), 1.2 * axis]), f"inertial axis {k + 1}", COLOURS[k], 2, "dash")
+    inertial_axes = [
+        _line_3d(np.stack([np.zeros(3), 1.2 * axis]), f"inertial axis {k + 1}", COLOURS[k], 2, "dash")
         for k, axis in enumerate(np.eye(3))
     ]
-    frames = [{"name": f"{t[k]:.4g}", "data": lines(q[k]), "traces": [0, 1, 2, 3]} for k in shown]
+    frames = [{"name": f"{t[k]:.4g}", "data": body_lines(q[k]), "traces": [0, 1, 2, 3]} for k in samples]
     still = {"mode": "immediate", "transition": {"duration": 0}, "frame": {"duration": 60, "redraw": True}}
     at_once = {**still, "frame": {"duration": 0, "redraw": True}}
     steps = [{"method": "animate", "label": f["name"], "args": [[f["name"]], at_once]} for f in frames]
@@ -118,35 +118,36 @@ def attitude(t: np.ndarray, q: np.ndarray) -> Chart:
     camera = {"eye": {"x": 1.0, "y": 1.0, "z": 0.7}, "center": {"x": 0.0, "y": 0.0, "z": -0.1}}
     scene = {"xaxis": axis, "yaxis": axis, "zaxis": axis, "aspectmode": "cube", "camera": camera}
     layout = _layout(scene=scene, updatemenus=[play], sliders=[slider])
-    return {"data": [*lines(q[shown[0]]), *fixed], "layout": layout, "frames": frames}
+    return {"data": [*body_lines(q[samples[0]]), *inertial_axes], "layout": layout, "frames": frames}
 
 
-def _line(points: np.ndarray, name: str, colour: str, width: int, dash: str = "solid") -> Chart:
-    x, y, z = (numbers(points[:, k]) for k in range(3))
+def _line_3d(points: np.ndarray, name: str, colour: str, width: int, dash: str = "solid") -> Chart:
+    x, y, z = (to_json_numbers(points[:, k]) for k in range(3))
     return {"type": "scatter3d", "mode": "lines", "name": name, "x": x, "y": y, "z": z, "hoverinfo": "name",
             "line": {"color": colour, "width": width, "dash": dash}}  # fmt: skip
 
 
-def front(found: Front, limit: float | None) -> Chart:
+def front(pareto: Front, limit: float | None) -> Chart:
     """Return the chart of error over peak torque: the front, dominated points, and the reference gains.
 
     Args:
-        found: the front of error against torque.
+        pareto: the front of error against torque.
         limit: the required largest peak torque [N m].
     """
     groups: list[tuple[str, list[Point], Chart]] = [
-        ("front", found.kept, {"mode": "lines+markers", "marker": {"size": 8}, "line": {"shape": "hv"}}),
-        ("knee", [p for p in found.kept if p.knee], {"mode": "markers", "marker": {"size": 15, "symbol": "star"}}),
-        ("dominated", [p for p in found.points if p.dominated], {"mode": "markers", "marker": {"symbol": "x"}}),
+        ("front", pareto.non_dominated, {"mode": "lines+markers", "marker": {"size": 8}, "line": {"shape": "hv"}}),
+        ("knee", [p for p in pareto.non_dominated if p.knee],
+         {"mode": "markers", "marker": {"size": 15, "symbol": "star"}}),
+        ("dominated", [p for p in pareto.points if p.dominated], {"mode": "markers", "marker": {"symbol": "x"}}),
         *((label, [point], {"mode": "markers", "marker": {"size": 12, "symbol": "diamond"}})
-          for label, point in found.labelled().items()),
+          for label, point in pareto.labelled().items()),
     ]  # fmt: skip
-    data, (shown, error, unit) = [], shown_error(found.plant)
+    data, (convert, error, unit) = [], error_display(pareto.plant)
     for k, (name, points, style) in enumerate(groups):
         group = [p for p in points if p.rms >= 0.0]  # NaN if no trial was simulated to its end
         if group:
-            rms = shown([p.rms for p in group])
-            low, high = shown([p.interval or (p.rms, p.rms) for p in group]).T
+            rms = convert([p.rms for p in group])
+            low, high = convert([p.interval or (p.rms, p.rms) for p in group]).T
             bars = {
                 "type": "data", "symmetric": False, "visible": True, "thickness": 1,
                 "array": (high - rms).tolist(), "arrayminus": (rms - low).tolist(),
@@ -157,17 +158,17 @@ def front(found: Front, limit: float | None) -> Chart:
                 "hovertemplate": "%{text}<br>error %{y:.3g} " + unit + ", peak %{x:.4g}<extra>" + name + "</extra>",
                 "error_y": bars, **style, "marker": {**style["marker"], "color": COLOURS[k % len(COLOURS)]},
             })  # fmt: skip
-    along = {"title": {"text": f"peak torque [{unit_of('peak_torque', found.plant)}]"}, **_DECADES}
-    up = {"title": {"text": f"RMS {error} in the window [{unit}]"}, **_DECADES}
-    shapes = [] if limit is None else [_upright(limit, dash="dash")]
+    x_axis = {"title": {"text": f"peak torque [{unit_of('peak_torque', pareto.plant)}]"}, **_DECADES}
+    y_axis = {"title": {"text": f"RMS {error} in the window [{unit}]"}, **_DECADES}
+    shapes = [] if limit is None else [_vertical_line(limit, dash="dash")]
     notes = []
-    if found.lower_bound:
-        least = float(shown(found.lower_bound))
+    if pareto.lower_bound:
+        least = float(convert(pareto.lower_bound))
         level = {"y0": least, "y1": least, "xref": "paper", "x0": 0, "x1": 1}
         shapes.append({"type": "line", **level, "line": {"dash": "dot"}})
         notes.append({"text": "lower bound", "xref": "paper", "x": 1, "xanchor": "right", "y": np.log10(least),
                       "yanchor": "bottom", "showarrow": False})  # fmt: skip
-    return {"data": data, "layout": _layout(xaxis=along, yaxis=up, shapes=shapes, annotations=notes)}
+    return {"data": data, "layout": _layout(xaxis=x_axis, yaxis=y_axis, shapes=shapes, annotations=notes)}
 
 
 def laws(
@@ -188,25 +189,28 @@ def laws(
     """
     finite = {label: [None if v is None or not np.isfinite(v) else v for v in values]
               for label, (values, _) in series.items()}  # fmt: skip
-    every = [v for values in finite.values() for v in values if v is not None]
-    logarithmic = logarithmic and bool(every) and min(every) > 0.0 and max(every) >= 10.0 * min(every)
+    all_values = [v for values in finite.values() for v in values if v is not None]
+    logarithmic = (
+        logarithmic and bool(all_values) and min(all_values) > 0.0 and max(all_values) >= 10.0 * min(all_values)
+    )
     data = []
     for k, (label, (_, intervals)) in enumerate(series.items()):
-        away = [(0.0, 0.0) if v is None or not both else (both[1] - v, v - both[0])
-                for v, both in zip(finite[label], intervals, strict=True)]  # fmt: skip
+        error_bars = [(0.0, 0.0) if v is None or not bounds else (bounds[1] - v, v - bounds[0])
+                for v, bounds in zip(finite[label], intervals, strict=True)]  # fmt: skip
         data.append({
             "type": "scatter", "mode": "markers", "name": label, "x": finite[label], "y": list(names),
             "hovertemplate": "%{y}: %{x:.4g}<extra>" + label + "</extra>", "showlegend": len(series) > 1,
             "marker": {"size": 10, "color": COLOURS[k % len(COLOURS)], "symbol": SYMBOLS[k % len(SYMBOLS)]},
             "error_x": {"type": "data", "symmetric": False, "thickness": 1.5, "visible": any(intervals),
-                        "array": [one for one, _ in away], "arrayminus": [one for _, one in away]},
+                        "array": [one for one, _ in error_bars], "arrayminus": [one for _, one in error_bars]},
         })  # fmt: skip
-    across = {"title": {"text": axis}, **({**_DECADES, "dtick": 1} if logarithmic else {})}
-    up = {"autorange": "reversed", "automargin": True, "type": "category"}
-    lines = [_upright(at, dash="dot") for at in marks.values()]
-    notes = [{"text": what, "x": np.log10(at) if logarithmic else at, "yref": "paper", "y": 0, "yanchor": "bottom",
-              "xanchor": "left", "showarrow": False} for what, at in marks.items()]  # fmt: skip
-    return {"data": data, "layout": _layout(xaxis=across, yaxis=up, shapes=lines, annotations=notes)}
+    x_axis = {"title": {"text": axis}, **({**_DECADES, "dtick": 1} if logarithmic else {})}
+    y_axis = {"autorange": "reversed", "automargin": True, "type": "category"}
+    lines = [_vertical_line(position, dash="dot") for position in marks.values()]
+    notes = [{"text": label, "x": np.log10(position) if logarithmic else position, "yref": "paper", "y": 0,
+              "yanchor": "bottom", "xanchor": "left", "showarrow": False}
+             for label, position in marks.items()]  # fmt: skip
+    return {"data": data, "layout": _layout(xaxis=x_axis, yaxis=y_axis, shapes=lines, annotations=notes)}
 
 
 def search(rows: Sequence[Mapping[str, str]], objective: str) -> Chart:
@@ -214,24 +218,24 @@ def search(rows: Sequence[Mapping[str, str]], objective: str) -> Chart:
     starts: dict[str, list[Mapping[str, str]]] = {}
     for row in rows:
         starts.setdefault(row["start"], []).append(row)
-    over = [name for name in rows[0] if name.endswith("_over_limit")]
-    gains = [name for name in rows[0] if name not in ("step", "start", objective, *over)]
+    ratio_columns = [name for name in rows[0] if name.endswith("_over_limit")]
+    gains = [name for name in rows[0] if name not in ("step", "start", objective, *ratio_columns)]
     data = []
     for k, (start, steps) in enumerate(starts.items()):
-        met = [all(float(row[name] or "nan") <= 1.0 for name in over) for row in steps]
+        met = [all(float(row[name] or "nan") <= 1.0 for name in ratio_columns) for row in steps]
         data.append({
             "type": "scatter", "mode": "lines+markers", "name": f"start {start}",
             "x": [int(row["step"]) for row in steps],
-            "y": numbers(np.array([float(row[objective] or "nan") for row in steps])),
+            "y": to_json_numbers(np.array([float(row[objective] or "nan") for row in steps])),
             "text": [", ".join(f"{name} {float(row[name]):.4g}" for name in gains) for row in steps],
             "hovertemplate": "step %{x}: %{y:.3e}<br>%{text}<extra></extra>",
             "marker": {"size": 6, "symbol": ["circle" if one else "circle-open" for one in met]},
             "line": {"width": 1, "color": COLOURS[k % len(COLOURS)]},
         })  # fmt: skip
-    up = {"title": {"text": objective.replace("_", " ")}, **_DECADES}
-    return {"data": data, "layout": _layout(xaxis={"title": {"text": "step of the local search"}}, yaxis=up)}
+    y_axis = {"title": {"text": objective.replace("_", " ")}, **_DECADES}
+    return {"data": data, "layout": _layout(xaxis={"title": {"text": "step of the local search"}}, yaxis=y_axis)}
 
 
-def numbers(values: np.ndarray) -> list[float | None]:
+def to_json_numbers(values: np.ndarray) -> list[float | None]:
     """Return the values with None in place of NaN and infinity, which JSON does not have."""
     return [float(f"{v:.6g}") if np.isfinite(v) else None for v in values]

@@ -6,25 +6,25 @@ import threading
 import time
 from typing import TYPE_CHECKING, Self
 
-from tuning.output.formats import objective, ratio
+from tuning.output.formats import format_objective, format_ratio
 
 if TYPE_CHECKING:
     from ptsmc_jax.campaigns.campaign import Tally
 
-EVERY = 10.0  # time between two printed lines [s]
+INTERVAL = 10.0  # time between two printed lines [s]
 
 
-def line(what: str, done: int, total: int, seconds: float) -> str:
+def format_progress(step: str, done: int, total: int, seconds: float) -> str:
     """Return a line of progress. A total of 0: unknown.
 
-    >>> line("searching", 1, 7, 10.4), line("compiling", 0, 0, 10.2)
+    >>> format_progress("searching", 1, 7, 10.4), format_progress("compiling", 0, 0, 10.2)
     ('ptsmc: searching, 1 of 7, 10 s', 'ptsmc: compiling, 10 s')
     """
     fraction = "" if not total else f", {done} of {total}"
-    return f"ptsmc: {what}{fraction}, {seconds:.0f} s"
+    return f"ptsmc: {step}{fraction}, {seconds:.0f} s"
 
 
-class Lines:
+class ProgressLines:
     """Prints the latest progress every ten seconds within `with`, also during long compilations.
 
     Args:
@@ -43,30 +43,30 @@ class Lines:
     def __exit__(self, *_: object) -> None:
         self._ended.set()
 
-    def __call__(self, what: str, done: int, total: int) -> None:
+    def __call__(self, step: str, done: int, total: int) -> None:
         """Report the current step, and the number of steps done and in all."""
-        self._doing = (what, done, total)
+        self._doing = (step, done, total)
 
     def __rich__(self) -> str:
         """Return the current step, or the program that it waits for, for a column of `rich`."""
-        return _compiling() or self._doing[0]
+        return _compilation_progress() or self._doing[0]
 
     def _watch(self) -> None:
-        while not self._ended.wait(EVERY):
-            compiling, seconds = _compiling(), time.monotonic() - self._begun
-            text = line(compiling, 0, 0, seconds) if compiling else line(*self._doing, seconds)
+        while not self._ended.wait(INTERVAL):
+            compiling, seconds = _compilation_progress(), time.monotonic() - self._begun
+            text = format_progress(compiling, 0, 0, seconds) if compiling else format_progress(*self._doing, seconds)
             with contextlib.suppress(OSError):  # a closed pipe or a full disk is no reason to stop
                 print(text, file=sys.stderr, flush=True)
 
 
-def _compiling() -> str:
+def _compilation_progress() -> str:
     """Return which program is being compiled, see `programs.compiling`, without importing JAX."""
     programs = sys.modules.get("ptsmc_jax.programs")
     return "" if programs is None else programs.compiling()
 
 
 class Bar:
-    """A progress bar with the time left, within `with`; `Lines` if the error stream is no terminal.
+    """A progress bar with the time left, within `with`; `ProgressLines` if the error stream is no terminal.
 
     Args:
         quiet: print nothing.
@@ -78,7 +78,7 @@ class Bar:
         from rich.console import Console
 
         console = Console(stderr=True)
-        self._lines = Lines(silent=quiet or console.is_terminal)
+        self._lines = ProgressLines(silent=quiet or console.is_terminal)
         self._bar = progress.Progress(
             progress.RenderableColumn(self._lines),
             progress.BarColumn(20),
@@ -115,15 +115,15 @@ class Progress(Bar):
         super().__init__(quiet, counted=True)
         self._objective, self._plant, self._total = objective, plant, 0
 
-    def __call__(self, what: str, done: int, total: int, value: float = float("nan"), violation: float = 0.0) -> None:
+    def __call__(self, step: str, done: int, total: int, value: float = float("nan"), violation: float = 0.0) -> None:
         """Report the current step, the number of steps done and in all, the best objective, and its violation."""
         if total != self._total:
             self._total = total
             self._bar.reset(self._task, total=total or None)
-        limits = "limits met" if violation == 0.0 else f"{ratio(100.0 * violation)} % beyond a limit"
-        best = f": {objective(self._objective, value, self._plant)}, {limits}" if value == value else ""
+        limits = "limits met" if violation == 0.0 else f"{format_ratio(100.0 * violation)} % beyond a limit"
+        best = f": {format_objective(self._objective, value, self._plant)}, {limits}" if value == value else ""
         self._bar.update(self._task, completed=done, total=total or None)
-        self._lines(what + best, done, total)
+        self._lines(step + best, done, total)
 
 
 class CampaignProgress(Bar):
@@ -138,8 +138,8 @@ class CampaignProgress(Bar):
         now = time.monotonic()
         if self._started is None:
             self._started = now, tally.done
-        since, before = self._started
-        rate = (tally.done - before) / (now - since) if tally.done > before else 0.0
+        start, done_at_start = self._started
+        rate = (tally.done - done_at_start) / (now - start) if tally.done > done_at_start else 0.0
         text = f"{tally.done} of {tally.total} trials"
         if rate:
             text += f", {rate:,.0f} a second" if rate >= 1.0 else f", {rate:.1g} a second"

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from tuning.output.formats import ratio
+from tuning.output.formats import format_ratio
 
 if TYPE_CHECKING:  # summaries imports NumPy, which a command that computes nothing need not wait for
     from tuning.output.summaries import Entry
@@ -128,25 +128,25 @@ HEADLINES = {
 }
 
 
-def headline(status: str, verdicts: "Sequence[Entry]", first: str = "") -> tuple[str, str]:
+def headline(status: str, verdicts: "Sequence[Entry]", error_text: str = "") -> tuple[str, str]:
     """Return the headline and its mood.
 
     Args:
         status: of the summary.
         verdicts: on the requirements.
-        first: the number that the user decides by, with its name; empty: there is none.
+        error_text: the number that the user decides by, with its name; empty: there is none.
     """
     text = HEADLINES.get(status, f"the run failed: {status.replace('_', ' ')}")
     if not verdicts and status in ("met", "not met"):
         text = "every trial reached its end" if status == "met" else "NOT every trial reached its end"
     mood = {"met": "good", "ok": "calm"}.get(status, "bad")
     mood = "calm" if mood == "good" and not verdicts else mood
-    return f"{first}: {text}" if first else text[0].upper() + text[1:], mood
+    return f"{error_text}: {text}" if error_text else text[0].upper() + text[1:], mood
 
 
-def requirements(verdicts: "Sequence[Entry]", text: "Callable[[Entry], str]" = str) -> list[Section]:
-    """Return the section of the requirements, none without any; text: returns a verdict in words."""
-    lines = [f"{text(one)}{per_cent_of_limit(one)}" for one in verdicts]
+def requirement_sections(verdicts: "Sequence[Entry]", format_verdict: "Callable[[Entry], str]" = str) -> list[Section]:
+    """Return the section of the requirements, none without any; format_verdict: returns a verdict in words."""
+    lines = [f"{format_verdict(verdict)}{per_cent_of_limit(verdict)}" for verdict in verdicts]
     return [Section("Requirements", [Bars(list(verdicts), lines)])] if verdicts else []
 
 
@@ -155,5 +155,5 @@ def per_cent_of_limit(entry: "Entry") -> str:
     if entry.margin is None or entry.at_least or entry.limit == 0.0:
         return ""
     if entry.fraction_of_time is not None:
-        return f"; {ratio(100 * entry.margin)} % of the time allowed beyond the limit"
-    return f"; {ratio(100 * entry.margin)} % of the limit"
+        return f"; {format_ratio(100 * entry.margin)} % of the time allowed beyond the limit"
+    return f"; {format_ratio(100 * entry.margin)} % of the limit"

@@ -79,8 +79,8 @@ class Group(msgspec.Struct, frozen=True):
 
     def number(self, metric: str, statistic: str) -> Number:
         """Return a statistic of a metric; None without trials that have it."""
-        found = self.metrics.get(metric)
-        return None if found is None else getattr(found, statistic)
+        statistics = self.metrics.get(metric)
+        return None if statistics is None else getattr(statistics, statistic)
 
 
 class Earlier(msgspec.Struct, frozen=True):
@@ -439,7 +439,7 @@ class Paper(msgspec.Struct, frozen=True):
 
 def read(kind: type[T], summary: Mapping[str, Any]) -> T:
     """Return a summary as this class. Raises msgspec.ValidationError if a field is missing or has another type."""
-    return msgspec.convert(store.plain(summary), kind)
+    return msgspec.convert(store.to_json_value(summary), kind)
 
 
 def run(summary: Mapping[str, Any], plant: str) -> Run:
@@ -449,17 +449,17 @@ def run(summary: Mapping[str, Any], plant: str) -> Run:
         {**entry, "metric": name, "unit": units[name].unit, "trials": 1, "failures": int(not entry["met"])}
         for name, entry in summary["verdicts"].items()
     ]
-    return read(Run, {**_folded(summary), "verdicts": verdicts})
+    return read(Run, {**_collect_metrics(summary), "verdicts": verdicts})
 
 
 def tune(summary: Mapping[str, Any]) -> Tune:
     """Return the summary of a tuning; see `read`."""
     names = ("training", "held_out", "published", "before")
-    groups = {name: _folded(summary[name]) for name in names if summary.get(name)}
+    groups = {name: _collect_metrics(summary[name]) for name in names if summary.get(name)}
     return read(Tune, {**summary, **groups})
 
 
-def _folded(entries: Mapping[str, Any]) -> dict[str, Any]:
+def _collect_metrics(entries: Mapping[str, Any]) -> dict[str, Any]:
     """Return the entries with all metrics in one table."""
     known = {**CATALOGUE, **CATALOGUES["chain"], **MARGINS}
     return {**entries, "metrics": {name: value for name, value in entries.items() if name in known}}

@@ -7,10 +7,10 @@ from typing import Any
 from tuning.output.report import Report, Table
 
 WIDE = 1000  # assumed number of columns of a file or a pipe
-UNBROKEN = 24  # largest number of columns of a cell that is never broken
+UNBROKEN_WIDTH = 24  # largest number of columns of a cell that is never broken
 
 
-def show(report: Report, folder: Path | str, *, earlier: bool = False) -> None:
+def print_report(report: Report, folder: Path | str, *, earlier: bool = False) -> None:
     """Print a report without its charts and pictures.
 
     Args:
@@ -18,24 +18,24 @@ def show(report: Report, folder: Path | str, *, earlier: bool = False) -> None:
         folder: of the result.
         earlier: an earlier run wrote the result.
     """
-    say(report.headline, *report.lines)
+    print_lines(report.headline, *report.lines)
     for title, content in report.printed():
         if title:
-            say("", title)
+            print_lines("", title)
         if isinstance(content, Table):
-            table(content)
+            print_table(content)
         else:
-            say(*content)
-    say("", f"results in {folder}" + (" (from an earlier run)" if earlier else ""))
+            print_lines(*content)
+    print_lines("", f"results in {folder}" + (" (from an earlier run)" if earlier else ""))
 
 
-def say(*lines: str) -> None:
+def print_lines(*lines: str) -> None:
     """Print lines; the terminal breaks them."""
     for line in lines:
         _print(line, soft_wrap=True, markup=False)
 
 
-def table(content: Table, **style: Any) -> None:
+def print_table(content: Table, **style: Any) -> None:
     """Print a table; style: of rich's `Table`."""
     from rich.console import Console
     from rich.markup import escape
@@ -43,27 +43,27 @@ def table(content: Table, **style: Any) -> None:
     from rich.table import Table as RichTable
     from rich.text import Text as RichText
 
-    printed = RichTable(pad_edge=False, **{"box": None, **style})
+    rich_table = RichTable(pad_edge=False, **{"box": None, **style})
     for k, name in enumerate(content.head):
-        printed.add_column(escape(name), min_width=max((_narrowest(row[k]) for row in content.rows), default=1))
+        rich_table.add_column(escape(name), min_width=max((_smallest_width(row[k]) for row in content.rows), default=1))
     for row in content.rows:
-        printed.add_row(*map(RichText, row))
+        rich_table.add_row(*map(RichText, row))
     # a file or a pipe has no width; a terminal that is too narrow for the numbers breaks the lines itself
     width, console = WIDE, Console()
     if console.is_terminal:
-        wide = Console(width=WIDE)
-        width = max(console.width, Measurement.get(wide, wide.options, printed).minimum)
-    _print(printed, width, crop=False)
+        wide_console = Console(width=WIDE)
+        width = max(console.width, Measurement.get(wide_console, wide_console.options, rich_table).minimum)
+    _print(rich_table, width, crop=False)
 
 
-def _narrowest(cell: str) -> int:
+def _smallest_width(cell: str) -> int:
     """Return the smallest width of a cell: numbers, names and units are not broken, sentences at their words."""
-    return len(cell) if len(cell) <= UNBROKEN else max(map(len, cell.split()))
+    return len(cell) if len(cell) <= UNBROKEN_WIDTH else max(map(len, cell.split()))
 
 
-def _print(content: Any, width: int | None = None, **how: Any) -> None:
+def _print(content: Any, width: int | None = None, **options: Any) -> None:
     """Print; a reader that closes the pipe, such as `head`, changes neither the work nor the exit status."""
     from rich.console import Console
 
     with contextlib.suppress(SystemExit):  # raised by rich for a closed pipe; it prints into nothing afterwards
-        Console(highlight=False, emoji=False, width=width).print(content, **how)
+        Console(highlight=False, emoji=False, width=width).print(content, **options)

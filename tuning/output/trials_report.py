@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.catalogues import percent
-from tuning.output.formats import with_unit
+from tuning.output.formats import add_unit
 from tuning.output.report import Table
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 ROUND_OFF = 1e-9  # relative: the programs of a campaign and of a run with its history round differently
 
 
-def worst(frame: "pl.DataFrame", by: str, plant: str) -> Table:
+def worst_trial_table(frame: "pl.DataFrame", by: str, plant: str) -> Table:
     """Return the table of the worst trials by a metric, the worst first; plant: its kind."""
     columns = ("trial", "status", by, "window_error", "peak_torque", "settling_time", "initial_angle")
     names = [name for name in dict.fromkeys(columns) if name in frame.columns]
@@ -25,22 +25,22 @@ def worst(frame: "pl.DataFrame", by: str, plant: str) -> Table:
         tuple("-" if v is None else f"{v:.5g}" if isinstance(v, float) else str(v) for v in row)
         for row in frame.select(names).iter_rows()
     ]
-    return Table(tuple(with_unit(name, plant) for name in names), rows)
+    return Table(tuple(add_unit(name, plant) for name in names), rows)
 
 
-def how_to_replay(frame: "pl.DataFrame", folder: Path, *, custom: bool) -> str:
-    """Return the command that replays the worst trial; custom: simulating it runs custom code."""
-    call = f"ptsmc replay {shlex.quote(str(folder))} --trial {frame['trial'][0]}" + (" --trust" if custom else "")
+def replay_hint(frame: "pl.DataFrame", folder: Path, *, is_custom: bool) -> str:
+    """Return the command that replays the worst trial; is_custom: simulating it runs custom code."""
+    call = f"ptsmc replay {shlex.quote(str(folder))} --trial {frame['trial'][0]}" + (" --trust" if is_custom else "")
     return f"all columns are in {folder / 'worst.csv'}; replay one trial with {call}"
 
 
-def why(inputs: list[dict[str, Any]], plant: str) -> Iterator[str]:
+def explanation_lines(inputs: list[dict[str, Any]], plant: str) -> Iterator[str]:
     """Return the inputs that explain a metric in each of the worst trials, as percentiles of all trials.
 
     If the trial failed, or too few trials show an influence, the inputs farthest from their medians are named.
 
     Args:
-        inputs: rows of `reasons.why`.
+        inputs: rows of `reasons.explain_worst_trials`.
         plant: its kind.
     """
     from ptsmc_jax.numerics import statistics
@@ -54,56 +54,60 @@ def why(inputs: list[dict[str, Any]], plant: str) -> Iterator[str]:
             explained.sort(key=lambda pair: pair[0], reverse=True)
             rows = [row for fraction, row in explained if fraction >= statistics.EXPLAINS]
         else:
-            rows.sort(key=_unusual, reverse=True)
-        texts = [f"{row['input']} {_with_unit(row['drawn'], row['unit'])} {_among(row)}" for row in rows[:4]]
+            rows.sort(key=_distance_from_median, reverse=True)
+        texts = [
+            f"{row['input']} {_format_with_unit(row['drawn'], row['unit'])} {_describe_percentile(row)}"
+            for row in rows[:4]
+        ]
         unit = catalogues.units(plant).get(metric, "")  # a custom metric has no unit
-        reached = f"no {metric}" if value is None else f"{metric} {_with_unit(value, unit)}"
-        none = "no sampled input explains it; sensor noise remains"
-        yield f"{reached} in trial {trial}: {', '.join(texts) or none}"
+        reached = f"no {metric}" if value is None else f"{metric} {_format_with_unit(value, unit)}"
+        nothing_found = "no sampled input explains it; sensor noise remains"
+        yield f"{reached} in trial {trial}: {', '.join(texts) or nothing_found}"
 
 
-def _among(row: dict[str, Any]) -> str:
+def _describe_percentile(row: dict[str, Any]) -> str:
     """Return the percentile of an input among all trials."""
     if row["fraction"] is not None:
         return f"as in {percent(row['fraction'])} % of the trials"
     return f"at {row['percentile']:.1f} % (median {row['median']:.3g})"
 
 
-def _unusual(row: dict[str, Any]) -> float:
+def _distance_from_median(row: dict[str, Any]) -> float:
     """Return the distance of an input from the median in per cent, or how few trials have the same value."""
     return 50.0 * (1.0 - row["fraction"]) if row["fraction"] is not None else abs(row["percentile"] - 50.0)
 
 
-def _with_unit(value: float, unit: str) -> str:
+def _format_with_unit(value: float, unit: str) -> str:
     return f"{value:.4g} {unit}".rstrip(" -")
 
 
-def replayed(off: float | None, rounding: float, same: float) -> Iterator[str]:
+def replay_lines(difference: float | None, history_difference: float, tolerance: float) -> Iterator[str]:
     """Return how a replayed trial agrees with its row.
 
     Args:
-        off: largest relative difference from the row; None: the campaign has no row of this trial.
-        rounding: the same of the run with its history from the replayed row.
-        same: the largest difference that counts as equal.
+        difference: largest relative difference from the row; None: the campaign has no row of this trial.
+        history_difference: the same of the run with its history from the replayed row.
+        tolerance: the largest difference that counts as equal.
     """
-    if off is None:
+    if difference is None:
         yield "the campaign has no row of this trial yet"
-    elif off == 0.0:
+    elif difference == 0.0:
         yield "the replayed trial equals its row to the last digit"
-    elif off <= same:
-        yield f"the replayed trial equals its row up to round-off: largest relative difference {off:.1e}"
+    elif difference <= tolerance:
+        yield f"the replayed trial equals its row up to round-off: largest relative difference {difference:.1e}"
     else:
-        yield f"the replayed trial does NOT equal its row: {_apart(off)}; see versions and machine in versions.json"
-    if rounding <= ROUND_OFF:
-        yield f"the history is of the same run up to round-off: largest relative difference {rounding:.0e}"
+        found = _describe_difference(difference)
+        yield f"the replayed trial does NOT equal its row: {found}; see versions and machine in versions.json"
+    if history_difference <= ROUND_OFF:
+        yield f"the history is of the same run up to round-off: largest relative difference {history_difference:.0e}"
     else:
         yield (
-            f"another program simulates the history, and its metrics differ: {_apart(rounding)}; a loop that chatters "
-            "or diverges magnifies round-off"
+            f"another program simulates the history, and its metrics differ: "
+            f"{_describe_difference(history_difference)}; a loop that chatters or diverges magnifies round-off"
         )
 
 
-def _apart(off: float) -> str:
-    if off == float("inf"):
+def _describe_difference(difference: float) -> str:
+    if difference == float("inf"):
         return "it ends with another status, or other values are missing"
-    return f"largest relative difference {off:.1e}"
+    return f"largest relative difference {difference:.1e}"

@@ -1,7 +1,7 @@
 """Confirmation of quantile requirements on trials that the search has not used.
 
-The verdict is made later on held-out trials. `count` simulates other trials and estimates the probability that this
-verdict will be met. Read `count` first.
+The verdict is made later on held-out trials. `count_violations` simulates other trials and estimates the
+probability that this verdict will be met. Read `count_violations` first.
 """
 
 import bisect
@@ -15,10 +15,10 @@ from tuning.search import simulations
 from tuning.search.objective import Problem
 
 HELD_OUT = 1000  # smallest number of held-out trials of the verdict
-FEWEST, TIMES = 4096, 8  # smallest number of confirmation trials: absolute, and relative to the held-out trials
-SHOWN = 2  # ratio of trials to the smallest number that can verify a quantile; with it some trials may break the limit
-SURE = 0.98  # a requirement is confirmed if its verdict will be met with at least this probability
-FARTHER, NEARER = 16, 8  # in a band: largest number of trials that may break the limit, and number that must keep it
+FEWEST_TRIALS, FEWEST_RATIO = 4096, 8  # smallest number of confirmation trials: absolute, relative to held-out trials
+SPARE_RATIO = 2  # ratio of trials to the fewest that can verify a quantile, so that some trials may break the limit
+CONFIDENT = 0.98  # a requirement is confirmed if its verdict will be met with at least this probability
+BAND_MAY_BREAK, BAND_MUST_KEEP = 16, 8  # trials in a band: at most 16 may break the limit, 8 must keep it
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ class Count:
     violations: int
     allowed: int | None  # largest number beyond the limit; None: too few trials to confirm the requirement
     probability: float  # probability that the verdict on held-out trials is met
-    harder: np.ndarray  # trials beyond the limit except for the `allowed` worst, the worst first
-    band: np.ndarray  # trials ranked around the last trial that may break the limit, see `may_break`
+    surplus_violators: np.ndarray  # trials beyond the limit except for the `allowed` worst, the worst first
+    band: np.ndarray  # trials ranked around the last trial that may break the limit, see `allowed_in_training`
 
     @property
     def confirmed(self) -> bool:
@@ -42,21 +42,23 @@ class Count:
 def held_out_trials(requirements: Sequence[Requirement]) -> int:
     """Return the number of held-out trials: enough to verify every quantile with some trials beyond the limit."""
     needed = [fewest_trials(r.quantile, r.confidence) for r in requirements if r.quantile and r.confidence]
-    return max([HELD_OUT, *(SHOWN * count for count in needed)])
+    return max([HELD_OUT, *(SPARE_RATIO * count for count in needed)])
 
 
 def confirmation_trials(requirements: Sequence[Requirement]) -> int:
     """Return the number of confirmation trials."""
-    return max(FEWEST, TIMES * held_out_trials(requirements))
+    return max(FEWEST_TRIALS, FEWEST_RATIO * held_out_trials(requirements))
 
 
-def may_break(requirement: Requirement, requirements: Sequence[Requirement], trials: int) -> tuple[int | None, bool]:
+def allowed_in_training(
+    requirement: Requirement, requirements: Sequence[Requirement], trials: int
+) -> tuple[int | None, bool]:
     """Return how many of the constrained trials may break a limit, and whether these trials are a band.
 
-    The number is None if every trial must keep the limit. Training trials represent a quantile if there are `SHOWN`
-    times the smallest number that can verify it. With this smallest number, every single trial would have to keep the
-    limit: 299 trials for 99 % of the trials with 95 % confidence. With fewer training trials, the `band` of a count
-    represents the confirmation trials.
+    The number is None if every trial must keep the limit. Training trials represent a quantile if there are
+    `SPARE_RATIO` times the smallest number that can verify it. With this smallest number, every single trial would have
+    to keep the limit: 299 trials for 99 % of the trials with 95 % confidence. With fewer training trials, the `band` of
+    a count represents the confirmation trials.
 
     Args:
         requirement: the requirement with the limit.
@@ -66,15 +68,15 @@ def may_break(requirement: Requirement, requirements: Sequence[Requirement], tri
     quantile, confidence = requirement.quantile, requirement.confidence
     if quantile is None:
         return None, False
-    if confidence is None or trials >= SHOWN * fewest_trials(quantile, confidence):
+    if confidence is None or trials >= SPARE_RATIO * fewest_trials(quantile, confidence):
         least = must_keep(trials, quantile, confidence)
         assert least is not None
         return trials - least, False
-    most = allowed(requirement, held_out_trials(requirements), confirmation_trials(requirements))
-    return min(FARTHER, most or 0), True
+    most = allowed_violations(requirement, held_out_trials(requirements), confirmation_trials(requirements))
+    return min(BAND_MAY_BREAK, most or 0), True
 
 
-def probability(requirement: Requirement, held_out: int, trials: int, violations: int) -> float:
+def verdict_probability(requirement: Requirement, held_out: int, trials: int, violations: int) -> float:
     """Return the probability that a verdict on held-out trials is met, given a count on other trials.
 
     The distribution is beta-binomial with a uniform prior on the fraction of trials that break the limit (Gelman and
@@ -96,8 +98,8 @@ def probability(requirement: Requirement, held_out: int, trials: int, violations
     )
 
 
-def allowed(requirement: Requirement, held_out: int, trials: int) -> int | None:
-    """Return the largest number of trials that may break the limit if `probability` must be at least `SURE`.
+def allowed_violations(requirement: Requirement, held_out: int, trials: int) -> int | None:
+    """Return the largest number of violations with a `verdict_probability` of at least `CONFIDENT`.
 
     Args:
         requirement: the requirement.
@@ -108,12 +110,14 @@ def allowed(requirement: Requirement, held_out: int, trials: int) -> int | None:
         The number, or None if the requirement cannot be confirmed on so few trials.
     """
     too_many = bisect.bisect_left(
-        range(trials), True, key=lambda violations: probability(requirement, held_out, trials, violations) < SURE
+        range(trials),
+        True,
+        key=lambda violations: verdict_probability(requirement, held_out, trials, violations) < CONFIDENT,
     )
     return too_many - 1 if too_many else None
 
 
-def count(
+def count_violations(
     problem: Problem, requirements: Sequence[Requirement], gains: np.ndarray, first: int, turn: int
 ) -> list[Count]:
     """Simulate confirmation trials and count the trials that break each limit.
@@ -128,26 +132,26 @@ def count(
     Returns:
         The count for each requirement.
     """
-    held_out, many = held_out_trials(requirements), confirmation_trials(requirements)
-    numbers = (first + turn * many + np.arange(many)).astype(np.uint32)
+    held_out, number = held_out_trials(requirements), confirmation_trials(requirements)
+    numbers = (first + turn * number + np.arange(number)).astype(np.uint32)
     simulated = simulations.simulate_trials(problem.batch_of(numbers), gains)
     counts = []
     for requirement in requirements:
         values = np.where(simulated.finished, getattr(simulated.metrics, requirement.metric), np.inf)
         ratio = violation_ratio(np.where(np.isnan(values), np.inf, values), requirement.limit, at_least=False)
-        farthest_first = numbers[np.argsort(-ratio, kind="stable")]
+        worst_first = numbers[np.argsort(-ratio, kind="stable")]
         violations = int(np.sum(ratio > 1.0))
-        most = allowed(requirement, held_out, many)
-        last = most or 0
+        allowed = allowed_violations(requirement, held_out, number)
+        first_kept = allowed or 0
         counts.append(
             Count(
                 metric=requirement.metric,
-                trials=many,
+                trials=number,
                 violations=violations,
-                allowed=most,
-                probability=probability(requirement, held_out, many, violations),
-                harder=farthest_first[last:violations],
-                band=farthest_first[max(0, last - FARTHER) : last + NEARER],
+                allowed=allowed,
+                probability=verdict_probability(requirement, held_out, number, violations),
+                surplus_violators=worst_first[first_kept:violations],
+                band=worst_first[max(0, first_kept - BAND_MAY_BREAK) : first_kept + BAND_MUST_KEEP],
             )
         )
     return counts

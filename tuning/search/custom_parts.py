@@ -20,10 +20,10 @@ from ptsmc_jax.onboard import sources
 from ptsmc_jax.scenario import custom, systems
 from ptsmc_jax.scenario.tables import Scenario
 
-METRICS, CONTROLLER = "--metrics", custom.CONTROLLER  # options that name programs
+METRICS, CONTROLLER = "--metrics", custom.CONTROLLER_OPTION  # options that name programs
 
 
-def named(scenario: Scenario, metrics: str | None = None, controller: Path | None = None) -> dict[str, str]:
+def list_custom_code(scenario: Scenario, metrics: str | None = None, controller: Path | None = None) -> dict[str, str]:
     """Return the location of all custom code that a simulation of a scenario runs, by key or option.
 
     Args:
@@ -32,17 +32,17 @@ def named(scenario: Scenario, metrics: str | None = None, controller: Path | Non
         controller: value of the option `--controller`, or None.
     """
     options = {METRICS: metrics, CONTROLLER: controller}
-    return custom.programs(scenario) | {key: str(where) for key, where in options.items() if where is not None}
+    return custom.code_by_key(scenario) | {key: str(where) for key, where in options.items() if where is not None}
 
 
 def location(key: str, where: str) -> str:
     """Return the path of the file, or the name of the module, that would be run."""
-    return os.path.realpath(where) if key in (CONTROLLER, custom.DATA) else systems.location(where)
+    return os.path.realpath(where) if key in (CONTROLLER, custom.DATA_FILE_KEY) else systems.location(where)
 
 
 def checksum(key: str, where: str) -> str | None:
     """Return the present SHA-256 checksum of the code or the data file, or None if it is in no file."""
-    if key == custom.DATA:
+    if key == custom.DATA_FILE_KEY:
         return systems.sha256(where)
     return sources.checksum(Path(where)) if key == CONTROLLER else systems.checksum(where)
 
@@ -56,46 +56,46 @@ def allow_scenario(path: Path, scenario: Scenario, trusted: bool) -> None:
         trusted: whether the user gave `--trust`. It matters only inside a folder of results.
 
     Raises:
-        RefusedError: See `allow`. It is raised only inside a folder of results.
+        RefusedError: See `allow_results`. It is raised only inside a folder of results.
     """
-    programs, folder = named(scenario), results_of(path)
+    programs, folder = list_custom_code(scenario), find_results_folder(path)
     if folder is None:
         _report(programs, path)
     else:
-        allow(programs, path, store.read_versions(folder), trusted)
+        allow_results(programs, path, store.read_versions(folder), trusted)
 
 
-def allow(programs: Mapping[str, str], results: Path, made: Mapping[str, Any], trusted: bool) -> None:
+def allow_results(programs: Mapping[str, str], results: Path, versions: Mapping[str, Any], trusted: bool) -> None:
     """Report the custom code that results name, and check that it may run.
 
     Args:
-        programs: locations of the code, see `named`.
+        programs: locations of the code, see `list_custom_code`.
         results: folder or scenario file that names the code.
-        made: content of the `versions.json` of the results.
+        versions: content of the `versions.json` of the results.
         trusted: whether the user gave `--trust`.
 
     Raises:
         RefusedError: The user did not give `--trust`, or the checksum of some code has changed.
     """
     if programs and not trusted:
-        listed = " and ".join(f"{file} ({', '.join(keys)})" for file, keys in _by_file(programs).items())
+        listed = " and ".join(f"{file} ({', '.join(keys)})" for file, keys in _group_by_file(programs).items())
         raise RefusedError(
             f"{results} names custom code, {listed}, which this command would run; "
             "read the code, then repeat the command with --trust"
         )
-    unknown = check_unchanged(programs, results, made)
+    unknown = check_unchanged(programs, results, versions)
     _report(programs, results)
-    for file in _by_file({key: programs[key] for key in unknown}):
+    for file in _group_by_file({key: programs[key] for key in unknown}):
         print(f"ptsmc: {results} has no checksum of {file}, which may have changed since", file=sys.stderr)
 
 
-def check_unchanged(programs: Mapping[str, str], results: Path, made: Mapping[str, Any]) -> list[str]:
+def check_unchanged(programs: Mapping[str, str], results: Path, versions: Mapping[str, Any]) -> list[str]:
     """Check that custom code has the checksums that results contain.
 
     Args:
-        programs: locations of the code, see `named`.
+        programs: locations of the code, see `list_custom_code`.
         results: folder or scenario file that names the code.
-        made: content of the `versions.json` of the results.
+        versions: content of the `versions.json` of the results.
 
     Returns:
         Keys of the code without a checksum in the results.
@@ -105,40 +105,41 @@ def check_unchanged(programs: Mapping[str, str], results: Path, made: Mapping[st
     """
     unknown = []
     for key, where in programs.items():
-        known, now = _known_checksums(made, key), checksum(key, where)
+        known, now = _known_checksums(versions, key), checksum(key, where)
         if not known:
             unknown.append(key)
         elif now is not None and now not in known:
-            then = " or ".join(was[:12] for was in known)
+            earlier = " or ".join(was[:12] for was in known)
             raise RefusedError(
-                f"{results} was made with another {key}: {location(key, where)} had the SHA-256 {then} then, and has "
-                f"{now[:12]} now; restore the earlier content of the file"
+                f"{results} was made with another {key}: {location(key, where)} had the SHA-256 {earlier} then, and "
+                f"has {now[:12]} now; restore the earlier content of the file"
             )
     return unknown
 
 
-def _known_checksums(made: Mapping[str, Any], key: str) -> list[str]:
+def _known_checksums(versions: Mapping[str, Any], key: str) -> list[str]:
     """Return the known checksums of custom code. A comparison has one for each of its laws, under the same key."""
-    laws = made.get("custom_laws") if key == "controller.code" else None
-    checksums = (made.get(custom.checksum_name(key)), *(laws.values() if isinstance(laws, dict) else ()))
+    laws = versions.get("custom_laws") if key == "controller.code" else None
+    checksums = (versions.get(custom.checksum_name(key)), *(laws.values() if isinstance(laws, dict) else ()))
     return list(dict.fromkeys(map(str, filter(None, checksums))))
 
 
-def carry(tables: dict[str, Any], folder: Path) -> dict[str, Any]:
+def copy_custom_files(tables: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Copy the Python and data files of a scenario into a folder, and refer to the copies in its tables.
 
-    Modules, and files that need other files (see `alone`), are not copied. The tables are changed and returned.
+    The function does not copy modules and files that need other files, see `is_self_contained`. It changes and returns
+    the tables.
     """
-    for table, key in custom.named(tables):
+    for table, key in custom.find_code_keys(tables):
         place, _, name = table[key].rpartition(":")
         if place.endswith(".py") and is_self_contained(Path(place)):
-            table[key] = f"{_copied(Path(place), folder).name}:{name}"
-    for table in custom.data_tables(tables):
-        table["file"] = _copied(Path(table["file"]), folder).name
+            table[key] = f"{_copy_file(Path(place), folder).name}:{name}"
+    for table in custom.find_data_tables(tables):
+        table["file"] = _copy_file(Path(table["file"]), folder).name
     return tables
 
 
-def _copied(file: Path, folder: Path) -> Path:
+def _copy_file(file: Path, folder: Path) -> Path:
     """Return a copy of a file in a folder, with a number in its name if another file has the name."""
     content = file.read_bytes()
     copies = (folder / (file.name if k == 1 else f"{file.stem}_{k}{file.suffix}") for k in itertools.count(1))
@@ -151,20 +152,20 @@ def is_self_contained(file: Path) -> bool:
     """Return whether a copy of a Python file can run: it imports nothing from its folder and uses no `__file__`."""
     try:
         nodes = ast.walk(ast.parse(file.read_bytes()))
-        asks = any(isinstance(node, ast.Name) and node.id == "__file__" for node in nodes)
+        uses_own_path = any(isinstance(node, ast.Name) and node.id == "__file__" for node in nodes)
     except (OSError, ValueError, SyntaxError, RecursionError):
         return False
-    return not asks and len(systems.imported(file, file.parent)) == 1
+    return not uses_own_path and len(systems.list_imported_files(file, file.parent)) == 1
 
 
-def _report(programs: Mapping[str, str], where_named: Path) -> None:
-    for file, keys in _by_file(programs).items():
+def _report(programs: Mapping[str, str], source: Path) -> None:
+    for file, keys in _group_by_file(programs).items():
         *first, last = keys
-        name = f"{', '.join(first)} and {last} of {where_named} name" if first else f"{last} of {where_named} names"
+        name = f"{', '.join(first)} and {last} of {source} name" if first else f"{last} of {source} names"
         print(f"ptsmc: runs {file}, which {name}", file=sys.stderr)
 
 
-def _by_file(programs: Mapping[str, str]) -> dict[str, list[str]]:
+def _group_by_file(programs: Mapping[str, str]) -> dict[str, list[str]]:
     """Return the keys that name each file, by its path."""
     files: dict[str, list[str]] = {}
     for key, where in programs.items():
@@ -172,7 +173,7 @@ def _by_file(programs: Mapping[str, str]) -> dict[str, list[str]]:
     return files
 
 
-def results_of(scenario: Path) -> Path | None:
+def find_results_folder(scenario: Path) -> Path | None:
     """Return the nearest folder of results above a scenario file, or None.
 
     The folders above the path as given come first, then those above the path with symbolic links resolved.

@@ -19,9 +19,9 @@ from ptsmc_jax.simulation.rollout import Parts
 from ptsmc_jax.theory import solutions
 from tuning.search.gains import in_scenario, with_gains
 
-FARTHEST = 100.0  # largest t_f to examine, relative to the t_f of the scenario
-CLOSE = 1e-3  # relative width at which the search by simulation ends
-LONGEST = 12  # largest number of simulated batches
+LONGEST_RATIO = 100.0  # largest t_f to examine, relative to the t_f of the scenario
+TOLERANCE = 1e-3  # relative width at which the search by simulation ends
+MOST_BATCHES = 12  # largest number of simulated batches
 
 
 @dataclass(frozen=True)
@@ -50,42 +50,44 @@ def shortest_time(loaded: Scenario, requirement: Requirement, seed: int, trials:
         trials: (trials,) numbers of the trials.
     """
     ready = scenario.study(loaded)
-    drawn = ready.dispersion, jnp.uint32(seed), jnp.asarray(trials, dtype=jnp.uint32)
+    trial_arguments = ready.dispersion, jnp.uint32(seed), jnp.asarray(trials, dtype=jnp.uint32)
     limit, quantile = requirement.limit, None if len(trials) == 1 else requirement.implied_by.quantile
     context = len(trials), quantile, requirement.unit
     # index of the trial that decides, in ascending order
     deciding = (must_keep(len(trials), quantile, requirement.confidence) or len(trials)) - 1
 
-    def predicted(t_f: float) -> float:
-        return float(np.sort(_predicted(ready.parts, *drawn, t_f))[deciding])
+    def predict_peak(t_f: float) -> float:
+        return float(np.sort(_predict_peaks(ready.parts, *trial_arguments, t_f))[deciding])
 
     present_t_f = float(ready.parts.controller.t_f)
     lowest = 1.05 * max(float(ready.parts.controller.delta), float(getattr(ready.parts.observer, "t_o", 0.0)))
-    rule = _smallest(predicted, limit, present_t_f, lowest, FARTHEST * present_t_f, CLOSE, 60)
-    if rule is None:
+    theory = _shortest_t_f(predict_peak, limit, present_t_f, lowest, LONGEST_RATIO * present_t_f, TOLERANCE, 60)
+    if theory is None:
         return ShortestTime(limit, None, None, *context)
 
-    def simulated_in(ready: scenario.Study, longest: float) -> float | None:
-        def simulated(t_f: float) -> float:
+    def search_by_simulation(ready: scenario.Study, longest: float) -> float | None:
+        def simulate_peak(t_f: float) -> float:
             parts = with_gains(ready.parts, {"t_f": t_f})
             result = montecarlo.run(parts, ready.dispersion, seed, trials)
             peaks = np.where(result.finished, result.metrics.peak_torque, np.inf)
             return float(np.sort(peaks)[deciding])
 
-        return _smallest(simulated, limit, rule, max(lowest, 0.2 * rule), longest, CLOSE, LONGEST)
+        return _shortest_t_f(simulate_peak, limit, theory, max(lowest, 0.2 * theory), longest, TOLERANCE, MOST_BATCHES)
 
     # first on the clock of the scenario, whose program is compiled anyway, and on a longer clock only if t_f is longer
-    shortest = simulated_in(ready, present_t_f) if rule <= present_t_f else None
+    shortest = search_by_simulation(ready, present_t_f) if theory <= present_t_f else None
     if shortest is None:
-        longest = max(1.5 * rule, present_t_f)
+        longest = max(1.5 * theory, present_t_f)
         with contextlib.suppress(ScenarioError):  # for example a reference that reaches the law's singularity later
-            roomy = scenario.study(in_scenario(loaded, {"t_f": longest}))
-            shortest = simulated_in(roomy, longest)
-    return ShortestTime(limit, rule, shortest, *context)
+            longer_study = scenario.study(in_scenario(loaded, {"t_f": longest}))
+            shortest = search_by_simulation(longer_study, longest)
+    return ShortestTime(limit, theory, shortest, *context)
 
 
 @programs.jit
-def _predicted(parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Array, t_f: jax.Array) -> jax.Array:
+def _predict_peaks(
+    parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Array, t_f: jax.Array
+) -> jax.Array:
     controller = replace(parts.controller, t_f=jnp.asarray(t_f, float))
 
     def peak(trial: jax.Array) -> jax.Array:
@@ -94,14 +96,14 @@ def _predicted(parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: ja
     return lapack.vmap(peak)(trials)
 
 
-def _smallest(
+def _shortest_t_f(
     peak: Callable[[float], float],
     limit: float,
     start: float,
     lowest: float,
     longest: float,
-    close: float,
-    most: int,
+    tolerance: float,
+    max_evaluations: int,
 ) -> float | None:
     """Return the smallest t_f with peak(t_f) <= limit, or None.
 
@@ -115,26 +117,26 @@ def _smallest(
         start: first t_f to examine [s].
         lowest: smallest t_f to examine [s].
         longest: largest t_f to examine [s]. If it breaks the limit, None is returned.
-        close: relative width of the bracket at which the search ends.
-        most: largest number of peaks to compute.
+        tolerance: relative width of the bracket at which the search ends.
+        max_evaluations: largest number of peaks to compute.
     """
     too_short, long_enough = lowest, None  # largest t_f that breaks the limit, and smallest t_f that keeps it
     guess = start
-    for looked in range(most):
+    for attempt in range(max_evaluations):
         value = peak(guess)
         if value <= limit:
             long_enough = guess
         else:
             too_short = max(too_short, guess)
-        if long_enough is not None and long_enough - too_short <= close * long_enough:
+        if long_enough is not None and long_enough - too_short <= tolerance * long_enough:
             break
         if long_enough is None and too_short >= longest:
             return None
         step = guess * (value / limit) ** 0.5 if np.isfinite(value) and value > 0 else 2 * guess
-        step *= 1 - 0.5 * close if value <= limit else 1 + 0.2 * close  # aim just beyond the crossing
-        bold = looked % 3 == 2
+        step *= 1 - 0.5 * tolerance if value <= limit else 1 + 0.2 * tolerance  # aim just beyond the crossing
+        halve_or_double = attempt % 3 == 2
         if long_enough is None:
-            guess = min(2 * too_short if bold else max(step, 1.001 * too_short), longest)
+            guess = min(2 * too_short if halve_or_double else max(step, 1.001 * too_short), longest)
         else:
-            guess = step if too_short < step < long_enough and not bold else 0.5 * (too_short + long_enough)
+            guess = step if too_short < step < long_enough and not halve_or_double else 0.5 * (too_short + long_enough)
     return long_enough

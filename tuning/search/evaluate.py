@@ -17,14 +17,14 @@ from ptsmc_jax import programs
 from tuning.search import margin_rows, simulations
 from tuning.search.journal import Journal
 from tuning.search.normalisation import Bounds, Scale
-from tuning.search.objective import FAILED, LEAST, LIMITS, Problem, Rules, ended, judge, watched
+from tuning.search.objective import FAILED, LEAST, LIMITS, Problem, Rules, ignore_failures, judge, needed_metrics
 
-TOGETHER = 16  # points of one call of the small compiled programs
-M = TypeVar("M", bound="Measured")
+POINTS_PER_CALL = 16  # points of one call of the small compiled programs
+M = TypeVar("M", bound="Measurement")
 
 
 @dataclass(frozen=True)
-class Measured:
+class Measurement:
     """F, constraints c and logarithm of the objective at many points, see `objective.judge`."""
 
     gains: np.ndarray  # (points, gains)
@@ -40,12 +40,12 @@ class Measured:
     @property
     def largest_c(self) -> np.ndarray:
         """Largest c over the completed trials, (points,). It is -1 without requirements."""
-        return ended(self.c).max(axis=(1, 2), initial=-1.0)
+        return ignore_failures(self.c).max(axis=(1, 2), initial=-1.0)
 
     @property
     def nearest(self) -> np.ndarray:
         """Index of the row with the largest c over the completed trials, (points,). It is 0 without requirements."""
-        largest = ended(self.c).max(axis=2, initial=-1.0)
+        largest = ignore_failures(self.c).max(axis=2, initial=-1.0)
         return largest.argmax(axis=1) if largest.shape[1] else np.zeros(len(largest), int)
 
     def at(self: M, point: int) -> M:
@@ -54,7 +54,7 @@ class Measured:
 
 
 @dataclass(frozen=True)
-class MeasuredWithGradients(Measured):
+class MeasurementWithGradients(Measurement):
     """Measurement with derivatives of F and c with respect to normalised gains."""
 
     f_gradient: np.ndarray  # (points, gains)
@@ -74,78 +74,81 @@ class Evaluator:
         self.bounds, self._journal = bounds, journal or Journal()
         self.rollouts, self.gradients = 0, 0  # number of rollouts without and with gradients
 
-    def count_on(self, other: "Evaluator") -> None:
+    def continue_counts(self, other: "Evaluator") -> None:
         """Continue the counts of an evaluator of the same scenario with other bounds."""
         self.rollouts, self.gradients = other.rollouts, other.gradients
 
-    def measure(self, problem: Problem, normalised: np.ndarray) -> Measured:
+    def measure(self, problem: Problem, normalised: np.ndarray) -> Measurement:
         """Return F, constraints and objective at points, (points, gains) normalised gains."""
         self.rollouts += len(normalised) * problem.trials.size
-        asked = _request(b"values", problem, normalised)
-        return Measured(**self._journal.get(asked, lambda: self._measured(self._metrics, problem, normalised)))
+        request = _encode_request(b"values", problem, normalised)
+        return Measurement(**self._journal.get(request, lambda: self._evaluate(self._judge, problem, normalised)))
 
-    def measure_with_gradients(self, problem: Problem, normalised: np.ndarray) -> MeasuredWithGradients:
+    def measure_with_gradients(self, problem: Problem, normalised: np.ndarray) -> MeasurementWithGradients:
         """Return F, constraints and objective with gradients at points, (points, gains) normalised gains."""
         self.gradients += len(normalised) * problem.trials.size
-        asked = _request(b"gradients", problem, normalised)
-        return MeasuredWithGradients(
-            **self._journal.get(asked, lambda: self._measured(self._metrics_with_gradients, problem, normalised))
+        request = _encode_request(b"gradients", problem, normalised)
+        return MeasurementWithGradients(
+            **self._journal.get(request, lambda: self._evaluate(self._judge_with_gradients, problem, normalised))
         )
 
-    def _measured(
-        self, way: Callable[[Problem, np.ndarray], dict[str, np.ndarray]], problem: Problem, normalised: np.ndarray
+    def _evaluate(
+        self, compute: Callable[[Problem, np.ndarray], dict[str, np.ndarray]], problem: Problem, normalised: np.ndarray
     ) -> dict[str, np.ndarray]:
-        values = way(problem, normalised)
+        values = compute(problem, normalised)
         if problem.margins is None:
             return values
         # margins always come with gradients: the compilation of a second program would take longer than it saves
-        of_loop = margin_rows.of_points(problem.margins, self.bounds.scale, normalised)
-        wide = max(values["c"].shape[2], of_loop["c"].shape[2])
+        of_margins = margin_rows.constraints_at_points(problem.margins, self.bounds.scale, normalised)
+        longest = max(values["c"].shape[2], of_margins["c"].shape[2])
 
-        def padded(c: np.ndarray, fill: float) -> np.ndarray:  # all rows get the length of the longest row
-            widths = [(0, wide - c.shape[2] if k == 2 else 0) for k in range(c.ndim)]
+        def pad(c: np.ndarray, fill: float) -> np.ndarray:  # all rows get the length of the longest row
+            widths = [(0, longest - c.shape[2] if k == 2 else 0) for k in range(c.ndim)]
             return np.pad(c, widths, constant_values=fill)
 
         for name, fill in (("c", -1.0), ("c_gradient", 0.0)):
             if name in values:
-                values[name] = np.concatenate([padded(values[name], fill), padded(of_loop[name], fill)], axis=1)
-        return _with_margins(values) if problem.objective == LIMITS else values
+                values[name] = np.concatenate([pad(values[name], fill), pad(of_margins[name], fill)], axis=1)
+        return _set_f_to_largest_ratio(values) if problem.objective == LIMITS else values
 
-    def _metrics(self, problem: Problem, normalised: np.ndarray) -> dict[str, np.ndarray]:
-        gains = self._gains(normalised)[0]
+    def _judge(self, problem: Problem, normalised: np.ndarray) -> dict[str, np.ndarray]:
+        gains = self._scale_gains(normalised)[0]
         values = simulations.simulate(problem.batch, gains)
-        metrics = np.stack([getattr(values.metrics, name) for name in watched(problem)], axis=-1)
-        return {"gains": gains, **_in_calls(partial(_judged, problem.rules), gains, metrics, np.asarray(values.status))}
+        metrics = np.stack([getattr(values.metrics, name) for name in needed_metrics(problem)], axis=-1)
+        return {
+            "gains": gains,
+            **_apply_in_calls(partial(_judge_points, problem.rules), gains, metrics, np.asarray(values.status)),
+        }
 
-    def _metrics_with_gradients(self, problem: Problem, normalised: np.ndarray) -> dict[str, np.ndarray]:
-        gains, along = self._gains(normalised)
-        values = simulations.simulate_with_derivatives(problem.batch, gains, along, watched(problem))
-        return {"gains": gains, **_in_calls(partial(_judged_derivatives, problem.rules), gains, along, *values)}
+    def _judge_with_gradients(self, problem: Problem, normalised: np.ndarray) -> dict[str, np.ndarray]:
+        gains, directions = self._scale_gains(normalised)
+        values = simulations.simulate_with_derivatives(problem.batch, gains, directions, needed_metrics(problem))
+        return {"gains": gains, **_apply_in_calls(partial(_judge_gradients, problem.rules), gains, directions, *values)}
 
-    def _gains(self, normalised: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _scale_gains(self, normalised: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the gains, (points, gains), and their derivatives by the normalised gains, (points, gains, gains)."""
-        gains = _in_calls(partial(_gains, scale=self.bounds.scale), normalised)
+        gains = _apply_in_calls(partial(_gains_with_derivatives, scale=self.bounds.scale), normalised)
         return gains["gains"], gains["along"]
 
 
-def _with_margins(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _set_f_to_largest_ratio(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Set F to ln of the largest metric / limit, including the rows of the margins, and update its gradient."""
-    c = ended(values["c"]).reshape(len(values["c"]), -1)
-    at, points = c.argmax(axis=1), np.arange(len(c))
-    largest = np.maximum(1.0 + c[points, at], LEAST)
+    c = ignore_failures(values["c"]).reshape(len(values["c"]), -1)
+    nearest, points = c.argmax(axis=1), np.arange(len(c))
+    largest = np.maximum(1.0 + c[points, nearest], LEAST)
     values["f"] = values["value"] = np.log(largest)
     if "c_gradient" in values:
-        values["f_gradient"] = values["c_gradient"].reshape(*c.shape, -1)[points, at] / largest[:, None]
+        values["f_gradient"] = values["c_gradient"].reshape(*c.shape, -1)[points, nearest] / largest[:, None]
     return values
 
 
-def _in_calls(program: Callable[..., dict[str, jax.Array]], *arrays: np.ndarray) -> dict[str, np.ndarray]:
-    """Apply a program for `TOGETHER` points to arrays with any number of points on the first axis."""
+def _apply_in_calls(program: Callable[..., dict[str, jax.Array]], *arrays: np.ndarray) -> dict[str, np.ndarray]:
+    """Apply a program for `POINTS_PER_CALL` points to arrays with any number of points on the first axis."""
     count = len(arrays[0])
-    padded = [np.resize(v, (-(-count // TOGETHER) * TOGETHER, *v.shape[1:])) for v in arrays]
+    padded = [np.resize(v, (-(-count // POINTS_PER_CALL) * POINTS_PER_CALL, *v.shape[1:])) for v in arrays]
     calls = [
-        {name: np.asarray(v) for name, v in program(*(v[k : k + TOGETHER] for v in padded)).items()}
-        for k in range(0, len(padded[0]), TOGETHER)
+        {name: np.asarray(v) for name, v in program(*(v[k : k + POINTS_PER_CALL] for v in padded)).items()}
+        for k in range(0, len(padded[0]), POINTS_PER_CALL)
     ]
     return {name: np.concatenate([call[name] for call in calls])[:count] for name in calls[0]}
 
@@ -153,38 +156,42 @@ def _in_calls(program: Callable[..., dict[str, jax.Array]], *arrays: np.ndarray)
 _ADDRESS = re.compile("0x[0-9a-f]+")  # address of a custom function, different in each process
 
 
-def _request(kind: bytes, problem: Problem, normalised: np.ndarray) -> bytes:
+def _encode_request(kind: bytes, problem: Problem, normalised: np.ndarray) -> bytes:
     leaves, structure = jax.tree.flatten(problem)
-    described = _ADDRESS.sub("", str(structure)).encode()
-    return b"|".join([kind, normalised.tobytes(), described, *(np.asarray(leaf).tobytes() for leaf in leaves)])
+    structure_text = _ADDRESS.sub("", str(structure)).encode()
+    return b"|".join([kind, normalised.tobytes(), structure_text, *(np.asarray(leaf).tobytes() for leaf in leaves)])
 
 
-@programs.jit(compiler_options=programs.QUICKLY)
-def _gains(normalised: jax.Array, scale: Scale) -> dict[str, jax.Array]:
+@programs.jit(compiler_options=programs.FAST_COMPILE)
+def _gains_with_derivatives(normalised: jax.Array, scale: Scale) -> dict[str, jax.Array]:
     derivatives = jax.vmap(jax.jacfwd(scale.gains))(normalised)
     return {"gains": jax.vmap(scale.gains)(normalised), "along": jnp.swapaxes(derivatives, 1, 2)}
 
 
-@programs.jit(compiler_options=programs.QUICKLY)
-def _judged(rules: Rules, gains: jax.Array, metrics: jax.Array, status: jax.Array) -> dict[str, jax.Array]:
+@programs.jit(compiler_options=programs.FAST_COMPILE)
+def _judge_points(rules: Rules, gains: jax.Array, metrics: jax.Array, status: jax.Array) -> dict[str, jax.Array]:
     return dict(zip(("f", "c", "value"), jax.vmap(partial(judge, rules))(gains, metrics, status), strict=True))
 
 
-@programs.jit(compiler_options=programs.QUICKLY)
-def _judged_derivatives(
-    rules: Rules, gains: jax.Array, along: jax.Array, metrics: jax.Array, status: jax.Array, derivatives: jax.Array
+@programs.jit(compiler_options=programs.FAST_COMPILE)
+def _judge_gradients(
+    rules: Rules, gains: jax.Array, directions: jax.Array, metrics: jax.Array, status: jax.Array, derivatives: jax.Array
 ) -> dict[str, jax.Array]:
     """Return F, constraints and objective with gradients, by the chain rule from gradients of gains and metrics."""
 
-    def one(gains: jax.Array, along: jax.Array, metrics: jax.Array, status: jax.Array, derivatives: jax.Array) -> dict:
-        def of(gains: jax.Array, metrics: jax.Array) -> tuple:
+    def judge_point(
+        gains: jax.Array, directions: jax.Array, metrics: jax.Array, status: jax.Array, derivatives: jax.Array
+    ) -> dict:
+        def f_and_c(gains: jax.Array, metrics: jax.Array) -> tuple:
             f, c, value = judge(rules, gains, metrics, status)
             return (f, c), value
 
-        (f, c), value = of(gains, metrics)
+        (f, c), value = f_and_c(gains, metrics)
         f_gradient, c_gradient = jax.vmap(
-            lambda by, change: jax.jvp(of, (gains, metrics), (by, change), has_aux=True)[1], in_axes=(0, 1), out_axes=-1
-        )(along, derivatives)
+            lambda direction, change: jax.jvp(f_and_c, (gains, metrics), (direction, change), has_aux=True)[1],
+            in_axes=(0, 1),
+            out_axes=-1,
+        )(directions, derivatives)
         return {"f": f, "c": c, "value": value, "f_gradient": f_gradient, "c_gradient": c_gradient}
 
-    return jax.vmap(one)(gains, along, metrics, status, derivatives)
+    return jax.vmap(judge_point)(gains, directions, metrics, status, derivatives)

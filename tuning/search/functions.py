@@ -36,9 +36,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from tuning.search.evaluate import Measured, MeasuredWithGradients
+from tuning.search.evaluate import Measurement, MeasurementWithGradients
 from tuning.search.local_search import Best, Start, search_locally
-from tuning.search.starts import distances, far_apart, penalised, spread
+from tuning.search.starts import choose_far_apart, distances, penalise, sobol_points
 
 Function = Callable[[Float[Array, " n"]], Float[Array, ""]]
 Constraints = Callable[[Float[Array, " n"]], Float[Array, "..."]]
@@ -118,26 +118,26 @@ def minimise(
     if not np.all(np.isfinite(upper - lower) & (lower < upper)):
         raise ValueError(f"bounds are {list(bounds)}, but must be finite, each lower one below its upper one")
     problem = _Problem(objective, constraints, lower, upper)
-    points = spread(lower.size, settings.sampled, np.random.default_rng(settings.seed))
-    seen = problem.measured(points)
-    known = np.flatnonzero(np.isfinite(seen.f))
-    if not known.size:
+    points = sobol_points(lower.size, settings.sampled, np.random.default_rng(settings.seed))
+    sampled = problem.measure(points)
+    finite = np.flatnonzero(np.isfinite(sampled.f))
+    if not finite.size:
         raise ValueError(f"the objective is finite at none of {settings.sampled} points of the box")
-    scale = max(float(np.median(seen.f[known]) - seen.f[known].min()), np.finfo(float).tiny)
-    merits = penalised((seen.f[known] - seen.f[known].min()) / scale, seen.largest_c[known], 1.0)
-    order = known[np.argsort(merits, kind="stable")].tolist()
+    scale = max(float(np.median(sampled.f[finite]) - sampled.f[finite].min()), np.finfo(float).tiny)
+    merits = penalise((sampled.f[finite] - sampled.f[finite].min()) / scale, sampled.largest_c[finite], 1.0)
+    order = finite[np.argsort(merits, kind="stable")].tolist()
     bests = []
-    for k in far_apart(order, distances(points), settings.starts):
-        best = Best(points[k], 1, 0.0)
+    for k in choose_far_apart(order, distances(points), settings.starts):
+        best, start = Best(points[k], 1, 0.0), Start(points[k])
         search_locally(
-            problem.with_gradients, best, Start(points[k]), settings.steps, close=settings.tolerance, steepest=np.inf
+            problem.measure_with_gradients, best, start, settings.steps, tolerance=settings.tolerance, steepest=np.inf
         )
         bests.append(best)
-    ended = sorted((best for best in bests if np.isfinite(best.f)), key=lambda best: best.rank)
-    if not ended:  # no starting point has a finite gradient
+    successful = sorted((best for best in bests if np.isfinite(best.f)), key=lambda best: best.rank)
+    if not successful:  # no starting point has a finite gradient
         raise ValueError("the objective has a finite gradient at no starting point")
-    found = [Local(problem.x(best.normalised), best.f, best.violation) for best in ended]
-    return Search(found, settings.sampled, problem.gradients)
+    results = [Local(problem.x(best.normalised), best.f, best.violation) for best in successful]
+    return Search(results, settings.sampled, problem.gradients)
 
 
 class _Problem:
@@ -146,37 +146,39 @@ class _Problem:
     def __init__(self, objective: Function, constraints: Constraints | None, lower: np.ndarray, upper: np.ndarray):
         self._lower, self._upper, self.gradients = lower, upper, 0
 
-        def both(normalised: Array) -> tuple[Array, Array]:
+        def evaluate(normalised: Array) -> tuple[Array, Array]:
             x = self.x(normalised)
             c = jnp.zeros(0) if constraints is None else jnp.ravel(constraints(x))
             return jnp.asarray(objective(x), dtype=float), c
 
-        self._values = jax.jit(jax.vmap(both))
-        self._both = jax.jit(lambda normalised: (both(normalised), jax.jacfwd(both)(normalised)))
+        self._evaluate = jax.jit(jax.vmap(evaluate))
+        self._differentiate = jax.jit(lambda normalised: (evaluate(normalised), jax.jacfwd(evaluate)(normalised)))
 
     def x(self, normalised: Any) -> Any:
         """Map a point of the unit cube to the box, (n,)."""
         return self._lower + (self._upper - self._lower) * normalised
 
-    def measured(self, normalised: np.ndarray) -> Measured:
+    def measure(self, normalised: np.ndarray) -> Measurement:
         """Return the values at many points, (points, n)."""
-        f, c = map(np.asarray, self._values(normalised))
-        return Measured(gains=normalised, f=f, c=_rows(c), value=np.zeros_like(f))
+        f, c = map(np.asarray, self._evaluate(normalised))
+        return Measurement(gains=normalised, f=f, c=_as_one_row(c), value=np.zeros_like(f))
 
-    def with_gradients(self, normalised: np.ndarray) -> MeasuredWithGradients:
+    def measure_with_gradients(self, normalised: np.ndarray) -> MeasurementWithGradients:
         """Return the values and gradients at one point, (1, n)."""
         self.gradients += 1
-        (f, c), (f_gradient, c_gradient) = jax.tree.map(lambda v: np.asarray(v)[None], self._both(normalised[0]))
-        return MeasuredWithGradients(
+        (f, c), (f_gradient, c_gradient) = jax.tree.map(
+            lambda v: np.asarray(v)[None], self._differentiate(normalised[0])
+        )
+        return MeasurementWithGradients(
             gains=normalised,
             f=f,
-            c=_rows(c),
+            c=_as_one_row(c),
             value=np.zeros_like(f),
             f_gradient=f_gradient,
-            c_gradient=_rows(c_gradient),
+            c_gradient=_as_one_row(c_gradient),
         )
 
 
-def _rows(c: np.ndarray) -> np.ndarray:
+def _as_one_row(c: np.ndarray) -> np.ndarray:
     """Return constraints as one row of `Measured.c`, (points, 1, constraints, ...), or no row if there are none."""
     return c[:, None][:, : min(1, c.shape[1])]

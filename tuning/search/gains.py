@@ -21,29 +21,31 @@ from ptsmc_jax.simulation.gains import present_values as present_values
 from ptsmc_jax.simulation.gains import with_gains as with_gains
 from ptsmc_jax.simulation.rollout import Parts
 
-AS_PUBLISHED = 0.05  # published delta of a spacecraft [s]
+PUBLISHED_DELTA = 0.05  # published delta of a spacecraft [s]
 
 
 def units(plant: str) -> dict[str, str]:
     """Return the unit of each gain that a plant of this kind can have, by name; "-" for a gain without unit."""
     tables: Any = SCENARIOS[plant].TABLES
-    return _units(
+    return _collect_units(
         (*tables["controller"].values(), *tables["observer"].values(), *FILTERS.values(), *COMMAND_FILTERS.values())
     )
 
 
 def units_of(scenario: Scenario) -> dict[str, str]:
     """Return the unit of each gain of a scenario, by name, including the gains of custom laws and observers."""
-    return units(scenario.plant.kind) | _units(type(table) for table in scenario.tuned_tables.values())
+    return units(scenario.plant.kind) | _collect_units(type(table) for table in scenario.tuned_tables.values())
 
 
-def _units(tables: Iterable[Any]) -> dict[str, str]:
+def _collect_units(tables: Iterable[Any]) -> dict[str, str]:
     """Return the unit of each gain of these tables, by name. The first table with the gain defines its unit."""
-    named = [(table, key, table.prefix + key.name) for table in tables if table.gains for key in keys.list_keys(table)]
-    return {name: key.unit or "-" for table, key, name in reversed(named) if name in table.gains}
+    gain_keys = [
+        (table, key, table.prefix + key.name) for table in tables if table.gains for key in keys.list_keys(table)
+    ]
+    return {name: key.unit or "-" for table, key, name in reversed(gain_keys) if name in table.gains}
 
 
-def named(scenario: Scenario) -> tuple[str, ...]:
+def free_gain_names(scenario: Scenario) -> tuple[str, ...]:
     """Return the names of the free gains, with one name for each axis if the scenario tunes per axis."""
     names: list[str] = []
     for name in scenario.search.gains:
@@ -61,7 +63,7 @@ def published_gains(scenario: Scenario) -> dict[str, float]:
     period.
     """
     units, table = mission.scales(scenario), LAWS[scenario.plant.kind]["prescribed_time"]
-    gains = {name: float(units.of(scaled)) for name, scaled in table.scaled.items() if name in table.gains}
+    gains = {name: float(units.scaled_value(scaled)) for name, scaled in table.scaled.items() if name in table.gains}
     if scenario.sampled:
         gains["delta"] = max(gains["delta"], scenario.loop.period)
     if scenario.motion == "chain":
@@ -71,7 +73,7 @@ def published_gains(scenario: Scenario) -> dict[str, float]:
 
 
 def design_gains(scenario: Scenario, parts: Parts, names: tuple[str, ...]) -> list[list[float]]:
-    """Return starting points that follow from the mission, see `mission.designs`.
+    """Return starting points that follow from the mission, see `mission.starting_designs`.
 
     A gain that the designs do not contain, such as a gain of a custom law, keeps the value of the scenario.
 
@@ -85,13 +87,13 @@ def design_gains(scenario: Scenario, parts: Parts, names: tuple[str, ...]) -> li
     """
     if not scenario.sampled:
         return []
-    found, current = [], dict(zip(names, present_values(parts, names), strict=True))
-    for design in mission.designs(scenario):
+    designs, current = [], dict(zip(names, present_values(parts, names), strict=True))
+    for design in mission.starting_designs(scenario):
         gains = scenario.controller.gains_of(design, scenario)
         if getattr(parts.observer, "linear", False):
             gains["observer_gain"] = design.observer
-        found.append([gains.get(base(name), value) for name, value in current.items()])
-    return found
+        designs.append([gains.get(base(name), value) for name, value in current.items()])
+    return designs
 
 
 def published_scenario(scenario: Scenario) -> Scenario:
@@ -111,13 +113,13 @@ def published_label(scenario: Scenario) -> str:
     """
     if not scenario.controller.law.prescribed:
         return "paper's law"
-    as_published = mission.published(scenario) and published_gains(scenario)["delta"] == AS_PUBLISHED
-    return "published" if as_published else "published, scaled"
+    unchanged = mission.is_published_case(scenario) and published_gains(scenario)["delta"] == PUBLISHED_DELTA
+    return "published" if unchanged else "published, scaled"
 
 
-def differ(one: Scenario, other: Scenario) -> bool:
+def controls_differ(one: Scenario, other: Scenario) -> bool:
     """Return whether two scenarios differ in controller, observer, estimator or sensors, with defaults filled in."""
-    one, other = one.written(), other.written()
+    one, other = one.complete_for_file(), other.complete_for_file()
     return any(
         getattr(one, name) != getattr(other, name) for name in ("controller", "observer", "estimator", "sensors")
     )

@@ -47,30 +47,30 @@ def check(
     """
     margin = np.asarray([*searched.margins.values()])
     problem = searched.problem.tightened(1.0 - margin)
-    without = problem if problem.margins is None else replace(problem, margins=None)
-    before, generation, replaced = evaluate.rollouts, 0, np.asarray(np.inf)
+    without_margins = problem if problem.margins is None else replace(problem, margins=None)
+    rollouts_before, generation, population_merits = evaluate.rollouts, 0, np.asarray(np.inf)
 
-    def merit_of(problem: Problem, normalised: np.ndarray) -> np.ndarray:
+    def compute_merits(problem: Problem, normalised: np.ndarray) -> np.ndarray:
         measured = evaluate.measure(problem, normalised)
         bad = FORBIDDEN * np.where(np.isfinite(measured.f), 1.0, 2.0) + np.log1p(np.maximum(measured.largest_c, 0.0))
         return np.where((measured.largest_c <= SLACK) & np.isfinite(measured.f), measured.f, bad)
 
-    def merit(normalised: np.ndarray) -> np.ndarray:
-        found = merit_of(without, normalised.T)
+    def evaluate_population(normalised: np.ndarray) -> np.ndarray:
+        merits = compute_merits(without_margins, normalised.T)
         # margins take far longer and can only increase the merit, so only points that survive without them need margins
-        chosen = found <= replaced
-        if without is not problem and chosen.any():
-            found[chosen] = merit_of(problem, normalised.T[chosen])
-        return found
+        improved = merits <= population_merits
+        if without_margins is not problem and improved.any():
+            merits[improved] = compute_merits(problem, normalised.T[improved])
+        return merits
 
-    def tell(intermediate_result) -> None:
-        nonlocal generation, replaced
-        generation, replaced = generation + 1, intermediate_result.population_energies.copy()
+    def report_generation(intermediate_result) -> None:
+        nonlocal generation, population_merits
+        generation, population_merits = generation + 1, intermediate_result.population_energies.copy()
         best = float(intermediate_result.fun)
         report("differential evolution", generation, GENERATIONS, float(np.exp(best)), 0.0 if best < FORBIDDEN else 1.0)
 
     result = differential_evolution(
-        merit,
+        evaluate_population,
         [(0.0, 1.0)] * len(problem.names),
         popsize=POPULATION,
         maxiter=GENERATIONS,
@@ -81,14 +81,14 @@ def check(
         vectorized=True,
         updating="deferred",
         init="sobol",
-        callback=tell,
+        callback=report_generation,
     )
     best = Best(result.x, len(problem.rows), margin)
     best.offer(result.x[None], evaluate.measure(problem, result.x[None]))
     if with_gradients:  # differential evolution converges slowly along a limit, so a local search follows
-        run = LocalSearches(evaluate, margin, STEPS, np.random.default_rng(seed))
-        run.search_locally(searched.problem, {0: result.x})
-        best = run.best
+        local_searches = LocalSearches(evaluate, margin, STEPS, np.random.default_rng(seed))
+        local_searches.search_locally(searched.problem, {0: result.x})
+        best = local_searches.best
     at_search, at_best = (
         evaluate.measure(problem, searched.normalised[None]),
         evaluate.measure(problem, best.normalised[None]),
@@ -98,5 +98,5 @@ def check(
         value=best.value,
         distance=float(at_search.f[0]) - best.f,
         kept=not best.failed and bool(np.all(best.worst <= 1.0)),  # with the original limits, which the verdict uses
-        rollouts=evaluate.rollouts - before,
+        rollouts=evaluate.rollouts - rollouts_before,
     )

@@ -1,7 +1,7 @@
 """A journal of the evaluations of a long computation. An interrupted computation resumes from it. See `Journal.get`.
 
 Records are appended to one file, each with its length and checksum. Only one process writes at a time, see
-`store.in_use`.
+`store.lock_folder`.
 """
 
 import io
@@ -21,7 +21,7 @@ class Journal:
 
     def __init__(self, path: Path | None = None):
         self._path = path
-        self._earlier = deque(_records(path.read_bytes()) if path is not None and path.exists() else ())
+        self._unused_records = deque(_read_records(path.read_bytes()) if path is not None and path.exists() else ())
         self._end = 0  # size of the records that were read or written, in bytes
 
     def get(self, question: bytes, compute: Callable[[], Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
@@ -32,37 +32,37 @@ class Journal:
                 and all later records are replaced.
             compute: returns the answer.
         """
-        asked = np.frombuffer(struct.pack("<I", zlib.crc32(question)), dtype=np.uint8)
-        if self._earlier:
-            record, end = self._earlier.popleft()
-            if np.array_equal(record.pop("question"), asked):
+        question_checksum = np.frombuffer(struct.pack("<I", zlib.crc32(question)), dtype=np.uint8)
+        if self._unused_records:
+            record, end = self._unused_records.popleft()
+            if np.array_equal(record.pop("question"), question_checksum):
                 self._end = end
                 return record
-            self._earlier.clear()
+            self._unused_records.clear()
         answer = {name: np.asarray(value) for name, value in compute().items()}
         if self._path is not None:
             with self._path.open("ab") as file:
                 file.truncate(self._end)  # removes an incomplete record, or records of other questions
-                self._end += file.write(_packed({"question": asked, **answer}))
+                self._end += file.write(_pack_record({"question": question_checksum, **answer}))
         return answer
 
 
-def _packed(record: Mapping[str, np.ndarray]) -> bytes:
+def _pack_record(record: Mapping[str, np.ndarray]) -> bytes:
     buffer = io.BytesIO()
     np.savez(buffer, **record)  # pyright: ignore[reportArgumentType]
     data = buffer.getvalue()
     return _HEAD.pack(len(data), zlib.crc32(data)) + data
 
 
-def _records(data: bytes) -> Iterator[tuple[dict[str, np.ndarray], int]]:
+def _read_records(data: bytes) -> Iterator[tuple[dict[str, np.ndarray], int]]:
     """Yield the complete records, each with the position of its end. Stop at a damaged record."""
-    at = 0
-    while at + _HEAD.size <= len(data):
-        length, checksum = _HEAD.unpack_from(data, at)
-        at += _HEAD.size
-        body = data[at : at + length]
+    position = 0
+    while position + _HEAD.size <= len(data):
+        length, checksum = _HEAD.unpack_from(data, position)
+        position += _HEAD.size
+        body = data[position : position + length]
         if len(body) < length or zlib.crc32(body) != checksum:
             return
-        at += length
+        position += length
         with np.load(io.BytesIO(body)) as loaded:
-            yield dict(loaded), at
+            yield dict(loaded), position

@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import minimize, nnls
 
-from tuning.search.evaluate import Measured, MeasuredWithGradients
-from tuning.search.objective import ended, failures
+from tuning.search.evaluate import Measurement, MeasurementWithGradients
+from tuning.search.objective import count_failures, ignore_failures
 
 ACTIVE = 1e-3  # a limit is active if c > -ACTIVE
 SLACK = 1e-4  # largest c of an admissible point
 ELASTIC = 0.1  # if c is larger at the starting point, the violation is minimised before the objective
 FAILURE_PENALTY = 1e3  # added to the relative violation for each failed trial
-CLOSE = 1e-5  # change of F at which a local search ends
+F_TOLERANCE = 1e-5  # change of F at which a local search ends
 # Scaling of the variables. The first step is the gradient divided by the square of the scaling. It may leave the
 # neighbourhood of the starting point with 1, and stays in it with 4.
 BOLD, CAREFUL = 1.0, 4.0
@@ -27,14 +27,14 @@ BOLD, CAREFUL = 1.0, 4.0
 STEEPEST = 30.0
 
 
-def largest(c: np.ndarray, margin: ArrayLike) -> np.ndarray:
+def largest_ratios(c: np.ndarray, margin: ArrayLike) -> np.ndarray:
     """Return the largest ratio of metric to limit over the completed trials, (points, rows).
 
     Args:
         c: (points, rows, trials) constraints whose limits are tighter by the margin.
         margin: (rows,) or one number, relative tightening of each limit [-].
     """
-    return (ended(c).max(axis=2, initial=-1.0) + 1.0) * (1.0 - np.asarray(margin))
+    return (ignore_failures(c).max(axis=2, initial=-1.0) + 1.0) * (1.0 - np.asarray(margin))
 
 
 class Best:
@@ -69,29 +69,29 @@ class Best:
         return self.failed_trials, self.violation, self.f
 
     @property
-    def so_far(self) -> tuple[float, float]:
+    def progress(self) -> tuple[float, float]:
         """Objective and relative violation of the best point, or NaN if no point was offered yet."""
         return (self.value, self.violation) if np.isfinite(self.f) else (np.nan, np.nan)
 
-    def offer(self, normalised: np.ndarray, seen: Measured) -> None:
+    def offer(self, normalised: np.ndarray, measured: Measurement) -> None:
         """Replace the best point by the best of these points, if that is better.
 
         Args:
             normalised: (points, gains) normalised gains.
-            seen: the measurement at these points with tightened limits. A point is admissible if it meets them.
+            measured: the measurement at these points with tightened limits. A point is admissible if it meets them.
         """
-        worst = largest(seen.c, self.margin)
+        worst = largest_ratios(measured.c, self.margin)
         violation = np.maximum((worst - (1.0 - self.margin)).max(axis=1, initial=-1.0) - SLACK, 0.0)
-        failed_trials = np.where(np.isfinite(seen.f), failures(seen.c), np.inf)
+        failed_trials = np.where(np.isfinite(measured.f), count_failures(measured.c), np.inf)
         violation = violation + FAILURE_PENALTY * failed_trials
-        first = int(np.lexsort((seen.f, violation, failed_trials))[0])
-        if np.isfinite(seen.f[first]) and (failed_trials[first], violation[first], seen.f[first]) < self.rank:
+        first = int(np.lexsort((measured.f, violation, failed_trials))[0])
+        if np.isfinite(measured.f[first]) and (failed_trials[first], violation[first], measured.f[first]) < self.rank:
             self.normalised, self.worst = normalised[first].copy(), worst[first]
-            self.f, self.value = float(seen.f[first]), float(seen.objective[first])
+            self.f, self.value = float(measured.f[first]), float(measured.objective[first])
             self.failed_trials, self.violation = float(failed_trials[first]), float(violation[first])
 
 
-class _StepsUsedError(Exception):
+class _StepLimitError(Exception):
     """A local search has measured its largest number of points."""
 
 
@@ -103,7 +103,7 @@ class Start:
     scale: float = BOLD  # scaling of the variables, see `BOLD` and `CAREFUL`
     fixed: Sequence[int] = ()  # indices of gains that are not changed
     # measurements of a shorter search from the same starting point, which a longer search reuses
-    seen: dict[bytes, MeasuredWithGradients] = field(default_factory=dict)
+    measurements: dict[bytes, MeasurementWithGradients] = field(default_factory=dict)
 
 
 class _FeasibleError(Exception):
@@ -115,16 +115,16 @@ class Relaxed:
     """Limits whose largest violation is minimised instead of the objective."""
 
     rows: Sequence[int] | None = None  # rows of the problem; None: all rows
-    to_the_end: bool = False  # continue after every limit is met, to maximise the distance from the limits
+    beyond_limits: bool = False  # continue after every limit is met, to maximise the distance from the limits
 
 
 def search_locally(
-    measure: Callable[[np.ndarray], MeasuredWithGradients],
+    measure: Callable[[np.ndarray], MeasurementWithGradients],
     best: Best,
     start: Start,
     steps: int,
-    keep: Callable[[MeasuredWithGradients], None] = lambda _: None,
-    close: float = CLOSE,
+    on_accepted: Callable[[MeasurementWithGradients], None] = lambda _: None,
+    tolerance: float = F_TOLERANCE,
     relaxed: Relaxed | None = None,
     steepest: float = STEEPEST,
 ) -> None:
@@ -141,30 +141,30 @@ def search_locally(
         best: is offered every point.
         start: starting point and scaling of the variables.
         steps: largest number of points to measure.
-        keep: is called with the measurement at each accepted point, but not during line searches.
-        close: change of F at which the search ends.
+        on_accepted: is called with the measurement at each accepted point, but not during line searches.
+        tolerance: change of F at which the search ends.
         relaxed: if given, only the violation of these limits is minimised, and the other limits are constraints.
         steepest: largest element of the gradients of F and c; larger gradients are scaled down.
     """
-    local = _Local(measure, best, start, steps, keep, close, steepest)
+    local = _LocalSearch(measure, best, start, steps, on_accepted, tolerance, steepest)
     first = start.scale * start.normalised
-    with contextlib.suppress(_StepsUsedError):
-        keep(local.at(first))
+    with contextlib.suppress(_StepLimitError):
+        on_accepted(local.at(first))
         if relaxed is not None:
-            local.least_violation(first, relaxed)
+            local.minimise_violation(first, relaxed)
             return
         if local.violation(first) > ELASTIC:
-            first = local.least_violation(first, Relaxed())
+            first = local.minimise_violation(first, Relaxed())
             if local.violation(first) > SLACK:
                 return
         last = local.minimise(first)
         if local.violation(last) > SLACK:
-            nearer = local.least_violation(last, Relaxed())
-            if local.violation(nearer) <= SLACK:
-                local.minimise(nearer)
+            feasible = local.minimise_violation(last, Relaxed())
+            if local.violation(feasible) <= SLACK:
+                local.minimise(feasible)
 
 
-class _Local:
+class _LocalSearch:
     """The two optimisation problems of a local search, with shared measurements.
 
     Variables are normalised gains times the scaling.
@@ -172,129 +172,129 @@ class _Local:
 
     def __init__(
         self,
-        measure: Callable[[np.ndarray], MeasuredWithGradients],
+        measure: Callable[[np.ndarray], MeasurementWithGradients],
         best: Best,
         start: Start,
         steps: int,
-        keep: Callable[[MeasuredWithGradients], None],
-        close: float,
+        on_accepted: Callable[[MeasurementWithGradients], None],
+        tolerance: float,
         steepest: float,
     ):
         self._steepest = steepest
         self._measure, self._best, self._start = measure, best, start
-        self._steps, self._record, self._close = steps, keep, close
-        self._seen, self._scale = start.seen, start.scale
+        self._steps, self._on_accepted, self._tolerance = steps, on_accepted, tolerance
+        self._measurements, self._scale = start.measurements, start.scale
         scaled = self._scale * start.normalised
         self._bounds = [(value, value) if k in start.fixed else (0.0, self._scale) for k, value in enumerate(scaled)]
 
-    def at(self, scaled: np.ndarray) -> MeasuredWithGradients:
+    def at(self, scaled: np.ndarray) -> MeasurementWithGradients:
         """Return the measurement at a point. A point is measured once."""
         key, point = scaled.tobytes(), np.clip(scaled / self._scale, 0.0, 1.0)[None]
-        if key not in self._seen:
-            if len(self._seen) == self._steps:
-                raise _StepsUsedError
-            self._seen[key] = self._measure(point)
-        if self._seen[key].finite[0]:
-            self._best.offer(point, self._seen[key])
-        return self._seen[key]
+        if key not in self._measurements:
+            if len(self._measurements) == self._steps:
+                raise _StepLimitError
+            self._measurements[key] = self._measure(point)
+        if self._measurements[key].finite[0]:
+            self._best.offer(point, self._measurements[key])
+        return self._measurements[key]
 
     def violation(self, scaled: np.ndarray) -> float:
         """Return the largest c of the completed trials."""
-        return float(ended(self.at(scaled).c).max(initial=-1.0))
+        return float(ignore_failures(self.at(scaled).c).max(initial=-1.0))
 
     def minimise(self, scaled: np.ndarray) -> np.ndarray:
         """Minimise F subject to c <= 0, and return the last point."""
         limits = {
             "type": "ineq",
-            "fun": lambda x: -_compressed(self.at(x), self._steepest)[0],
-            "jac": lambda x: -_compressed(self.at(x), self._steepest)[1] / self._scale,
+            "fun": lambda x: -_compress(self.at(x), self._steepest)[0],
+            "jac": lambda x: -_compress(self.at(x), self._steepest)[1] / self._scale,
         }
-        found = minimize(
+        result = minimize(
             lambda x: float(self.at(x).f[0]),
             scaled.copy(),
-            jac=lambda x: _clipped(self.at(x).f_gradient, self._steepest)[0] / self._scale,
+            jac=lambda x: _clip(self.at(x).f_gradient, self._steepest)[0] / self._scale,
             method="SLSQP",
             bounds=self._bounds,
             constraints=[limits] if self.at(scaled).c.shape[1] else [],
             callback=self._accept,
-            options={"maxiter": self._steps, "ftol": self._close},
+            options={"maxiter": self._steps, "ftol": self._tolerance},
         )
-        return np.clip(found.x, *np.transpose(self._bounds))
+        return np.clip(result.x, *np.transpose(self._bounds))
 
-    def least_violation(self, scaled: np.ndarray, relaxed: Relaxed) -> np.ndarray:
+    def minimise_violation(self, scaled: np.ndarray, relaxed: Relaxed) -> np.ndarray:
         """Minimise t subject to c <= t. Return the first point that meets every limit, or else the last point."""
         rows, trials = self.at(scaled).c.shape[1:]
         if not rows:
             return scaled
-        soft = np.repeat(np.isin(np.arange(rows), range(rows) if relaxed.rows is None else relaxed.rows), trials)
-        reached = np.array(scaled)
+        is_relaxed = np.repeat(np.isin(np.arange(rows), range(rows) if relaxed.rows is None else relaxed.rows), trials)
+        feasible_point = np.array(scaled)
 
-        def excess(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            nonlocal reached
-            seen = self.at(x)
-            if not relaxed.to_the_end and relaxed.rows is None and ended(seen.c).max() <= 0.0:
-                reached = np.array(x)
+        def measure_limits(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            nonlocal feasible_point
+            measured = self.at(x)
+            if not relaxed.beyond_limits and relaxed.rows is None and ignore_failures(measured.c).max() <= 0.0:
+                feasible_point = np.array(x)
                 raise _FeasibleError
-            return _compressed(seen, self._steepest)
+            return _compress(measured, self._steepest)
 
         limits = {
             "type": "ineq",
-            "fun": lambda y: y[-1] * soft - excess(y[:-1])[0],
-            "jac": lambda y: np.column_stack([-excess(y[:-1])[1] / self._scale, soft.astype(float)]),
+            "fun": lambda y: y[-1] * is_relaxed - measure_limits(y[:-1])[0],
+            "jac": lambda y: np.column_stack([-measure_limits(y[:-1])[1] / self._scale, is_relaxed.astype(float)]),
         }
-        first = _compressed(self.at(scaled), self._steepest)[0][soft].max()
+        first_violation = _compress(self.at(scaled), self._steepest)[0][is_relaxed].max()
         try:
-            found = minimize(
+            result = minimize(
                 lambda y: y[-1],
-                np.append(scaled, first),
+                np.append(scaled, first_violation),
                 jac=lambda y: np.append(np.zeros(scaled.size), 1.0),
                 method="SLSQP",
                 bounds=[*self._bounds, (-1.0, None)],
                 constraints=[limits],
                 callback=lambda y: self._accept(y[:-1]),
-                options={"maxiter": self._steps, "ftol": self._close},
+                options={"maxiter": self._steps, "ftol": self._tolerance},
             )
         except _FeasibleError:
-            return reached
-        return np.clip(found.x[:-1], *np.transpose(self._bounds))
+            return feasible_point
+        return np.clip(result.x[:-1], *np.transpose(self._bounds))
 
     def _accept(self, scaled: np.ndarray) -> None:
         key = np.ascontiguousarray(scaled).tobytes()
-        if key in self._seen:
-            self._record(self._seen[key])
+        if key in self._measurements:
+            self._on_accepted(self._measurements[key])
 
 
-def _compressed(seen: MeasuredWithGradients, steepest: float) -> tuple[np.ndarray, np.ndarray]:
+def _compress(measured: MeasurementWithGradients, steepest: float) -> tuple[np.ndarray, np.ndarray]:
     """Return ln(1 + c) for c above 0, else c, (limits,), and its derivatives, (limits, gains).
 
     c spans orders of magnitude far beyond a limit. The logarithm has the same sign as c and the same derivative at 0.
     """
-    c = ended(seen.c).reshape(-1)
+    c = ignore_failures(measured.c).reshape(-1)
     excess = np.maximum(c, 0.0)
-    gradients = seen.c_gradient.reshape(c.size, -1) / (1.0 + excess)[:, None]
-    return np.where(c > 0.0, np.log1p(excess), c), _clipped(gradients, steepest)
+    gradients = measured.c_gradient.reshape(c.size, -1) / (1.0 + excess)[:, None]
+    return np.where(c > 0.0, np.log1p(excess), c), _clip(gradients, steepest)
 
 
-def multipliers(at: MeasuredWithGradients, normalised: np.ndarray) -> np.ndarray:
+def estimate_multipliers(measured: MeasurementWithGradients, normalised: np.ndarray) -> np.ndarray:
     """Return the Lagrange multiplier of each limit at an optimum, (rows,). It is 0 for inactive limits.
 
     The multipliers are estimated by nonnegative least squares over the gains that are not on a bound.
 
     Args:
-        at: the measurement at the optimum.
+        measured: the measurement at the optimum.
         normalised: (gains,) normalised gains of the optimum.
     """
-    c, inside = ended(at.c[0]), (normalised > 0.0) & (normalised < 1.0)
+    c, inside = ignore_failures(measured.c[0]), (normalised > 0.0) & (normalised < 1.0)
     active = np.flatnonzero(c.max(axis=1, initial=-1.0) > -ACTIVE)
-    gradients = at.c_gradient[0, active, c[active].argmax(axis=1)]
+    gradients = measured.c_gradient[0, active, c[active].argmax(axis=1)]
     estimate = np.zeros(len(c))
     if active.size and inside.any():
-        estimate[active] = nnls(_clipped(gradients)[:, inside].T, -_clipped(at.f_gradient)[0, inside])[0]
+        estimate[active] = nnls(_clip(gradients)[:, inside].T, -_clip(measured.f_gradient)[0, inside])[0]
     return estimate
 
 
-def _clipped(gradients: np.ndarray, steepest: float = STEEPEST) -> np.ndarray:
+def _clip(gradients: np.ndarray, steepest: float = STEEPEST) -> np.ndarray:
     """Return gradients, (rows, gains), with no element above `steepest`. Rows that are not finite become zero."""
-    size = np.abs(gradients).max(axis=1, keepdims=True)
-    known = np.where(np.isfinite(size), gradients, 0.0)
-    return known * np.minimum(1.0, steepest / np.maximum(np.where(np.isfinite(size), size, 1.0), 1e-300))
+    largest = np.abs(gradients).max(axis=1, keepdims=True)
+    finite = np.where(np.isfinite(largest), gradients, 0.0)
+    return finite * np.minimum(1.0, steepest / np.maximum(np.where(np.isfinite(largest), largest, 1.0), 1e-300))

@@ -14,43 +14,43 @@ from numpy.typing import ArrayLike
 
 from ptsmc_jax import configure
 from tuning.search import hand_overs
-from tuning.search.evaluate import Evaluator, Measured, MeasuredWithGradients
-from tuning.search.evolution import WIDELY, evolve
+from tuning.search.evaluate import Evaluator, Measurement, MeasurementWithGradients
+from tuning.search.evolution import WHOLE_BOX, evolve
 from tuning.search.local_search import (
     BOLD,
     CAREFUL,
-    CLOSE,
+    F_TOLERANCE,
     SLACK,
     Best,
     Relaxed,
     Start,
-    largest,
-    multipliers,
+    estimate_multipliers,
+    largest_ratios,
     search_locally,
 )
 from tuning.search.lockstep import Ask, run_in_lockstep
 from tuning.search.normalisation import TIMES
-from tuning.search.objective import LIMITS, Problem, ended, failures, fewer_trials
+from tuning.search.objective import LIMITS, Problem, count_failures, fewer_trials, ignore_failures
 from tuning.search.progress import Report
 from tuning.search.starts import (
-    NEARLY,
+    NEARLY_ACTIVE,
     STEEP,
+    choose_promising,
     global_starting_points,
-    penalised,
-    promising,
-    spread,
+    penalise,
+    sobol_points,
     starting_points,
 )
 
 CONTINUED_SEARCHES = 3  # number of local searches that a further round continues
-EXPLORED, AVERAGED = 32, 16  # trials of the first searches, constraints included; smallest number in the objective
-TOGETHER = 2  # concurrent local searches for each device, so that the device waits for SLSQP less often
+FIRST_TRIALS, FEWEST_AVERAGED = 32, 16  # trials of the first searches; fewest of them in the objective
+SEARCHES_PER_DEVICE = 2  # concurrent local searches for each device, so that the device waits for SLSQP less often
 FOLLOWED_STARTS = 3  # number of explored starting points that continue with all trials
 SAME_F = 1e-4  # points are equally good if their F differs by less: 0.01 % of the objective
-FINAL_CLOSE = 1e-2  # factor on `CLOSE` for the last local search, from the best point
+FINAL_TOLERANCE = 1e-2 * F_TOLERANCE  # for the last local search, from the best point
 CONFLICTING = 0.1  # limits whose excess is within this fraction of the largest excess count as conflicting
 HAND_OVER_ATTEMPTS = 3  # largest number of attempts with other hand-over times
-MANY = 512  # Sobol points of a search without gradients
+SOBOL_POINTS = 512  # Sobol points of a search without gradients
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class _Contender:
 
 def _few_trials(problem: Problem) -> Problem:
     """Return the problem with few averaged trials, for the first searches."""
-    return fewer_trials(problem, max(AVERAGED, EXPLORED - (problem.trials.size - problem.averaged)))
+    return fewer_trials(problem, max(FEWEST_AVERAGED, FIRST_TRIALS - (problem.trials.size - problem.averaged)))
 
 
 class LocalSearches:
@@ -99,13 +99,13 @@ class LocalSearches:
         self._evaluate, self._steps, self._rng, self._report = evaluate, steps, rng, report
         self._margin = np.asarray(margin)  # relative tightening of each limit, (rows,) or one number
         self._scenario_gains: np.ndarray | None = None  # (gains,) gains of the scenario
-        self.globally = False  # whether `search_globally` was called
+        self.searched_globally = False  # whether `search_globally` was called
         self._designs = np.zeros((0, 0))  # (designs, gains) normalised gains of the designs
         self._best: Best | None = None
         self._problem: Problem | None = None
         self._history: dict[int, list[Step]] = {}  # accepted points by number of the local search
         self._ends: dict[int, Best] = {}  # best point of each local search
-        self._from = 0  # number of the local search that found the best point
+        self._best_start = 0  # number of the local search that found the best point
 
     @property
     def started(self) -> bool:
@@ -113,9 +113,9 @@ class LocalSearches:
         return self._best is not None and bool(np.isfinite(self._best.f))
 
     @property
-    def so_far(self) -> tuple[float, float]:
+    def progress(self) -> tuple[float, float]:
         """Objective and relative violation of the best point, or NaN before the first point."""
-        return (np.nan, np.nan) if self._best is None else self._best.so_far
+        return (np.nan, np.nan) if self._best is None else self._best.progress
 
     @property
     def best(self) -> Best:
@@ -157,14 +157,14 @@ class LocalSearches:
             scenario_gains: (gains,) gains of the scenario.
             designs: (designs, gains) gains of designs that follow from the mission.
         """
-        few, normalise = _few_trials(problem), self._evaluate.bounds.normalise
+        small, normalise = _few_trials(problem), self._evaluate.bounds.normalise
         self._scenario_gains, self._designs = scenario_gains, np.asarray([normalise(one) for one in designs])
-        self._report("first local search", 0, 2, *self.so_far)
+        self._report("first local search", 0, 2, *self.progress)
         points = np.concatenate([normalise(scenario_gains)[None], self._designs.reshape(-1, scenario_gains.size)])
         first = points[0]
         if len(points) > 1:
-            (first,) = promising(self._evaluate, self.tightened(few), points, 1, lambda *_: None)
-        self._search(few, 0, Start(first, CAREFUL), max(2, self._steps // 2))
+            (first,) = choose_promising(self._evaluate, self.tightened(small), points, 1, lambda *_: None)
+        self._search(small, 0, Start(first, CAREFUL), max(2, self._steps // 2))
 
     def explore(self, problem: Problem, starts: int, seed: int) -> dict[int, np.ndarray]:
         """Run short local searches on few trials from many starting points, and return the best results.
@@ -180,15 +180,15 @@ class LocalSearches:
         Returns:
             Normalised gains, (gains,), of at most `FOLLOWED_STARTS` results, by number of the local search.
         """
-        problem, more = _few_trials(problem), max(2, self._steps // 2)
-        self._report("first local search", 1, 2, *self.so_far)
-        self._search(problem, 0, Start(self.normalised, CAREFUL), more, replace_best=True)
+        problem, steps = _few_trials(problem), max(2, self._steps // 2)
+        self._report("first local search", 1, 2, *self.progress)
+        self._search(problem, 0, Start(self.normalised, CAREFUL), steps, replace_best=True)
         first = starting_points(
             self._evaluate, self.tightened(problem), self.normalised, self._designs, starts, seed, self._report
         )
-        return self._promising(problem, first)
+        return self._explore_starts(problem, first)
 
-    def _promising(self, problem: Problem, first: np.ndarray, number: int = 0) -> dict[int, np.ndarray]:
+    def _explore_starts(self, problem: Problem, first: np.ndarray, number: int = 0) -> dict[int, np.ndarray]:
         """Return the results of the best short local searches, by number of the local search.
 
         Args:
@@ -196,9 +196,9 @@ class LocalSearches:
             first: (starts, gains) normalised gains of the starting points.
             number: number of the first local search.
         """
-        few, more = max(2, self._steps // 4), max(2, self._steps // 2)
+        first_steps, more_steps = max(2, self._steps // 4), max(2, self._steps // 2)
         contenders = dict(enumerate(first, number))
-        stages = ((len(contenders), few), (max(FOLLOWED_STARTS, len(contenders) // 2), more))
+        stages = ((len(contenders), first_steps), (max(FOLLOWED_STARTS, len(contenders) // 2), more_steps))
         ranked = self._successive_halving(problem, contenders, stages, "searching", scales=(CAREFUL, BOLD))
         return {k: self._ends[k].normalised for k in ranked[:FOLLOWED_STARTS]} or {number: first[0]}
 
@@ -220,7 +220,7 @@ class LocalSearches:
         problem: Problem,
         starts: Mapping[int, np.ndarray],
         stages: Sequence[tuple[int, int]],
-        what: str,
+        step_name: str,
         *,
         scales: Sequence[float] = (CAREFUL,),
         replace_best: bool = False,
@@ -231,7 +231,7 @@ class LocalSearches:
             problem: the tuning problem.
             starts: (gains,) normalised gains of each starting point, by number of the local search.
             stages: for each stage, the number of local searches that continue, and the total steps of each.
-            what: name of the step in progress reports.
+            step_name: name of the step in progress reports.
             scales: scalings of the variables, which the local searches use in turn.
             replace_best: replace the best point so far by the first result, because the problem has changed.
         """
@@ -242,50 +242,52 @@ class LocalSearches:
         ranked = list(starts)
         for count, steps in stages:
             self._search_in_lockstep(
-                problem, {k: contenders[k] for k in ranked[:count]}, steps, what, replace_best=replace_best
+                problem, {k: contenders[k] for k in ranked[:count]}, steps, step_name, replace_best=replace_best
             )
             replace_best = False
             ends = {k: self._ends[k] for k in ranked if k in self._ends}
             ranked = sorted(
-                ends, key=lambda k, ends=ends: (ends[k].failed_trials, penalised(ends[k].f, ends[k].violation, STEEP))
+                ends, key=lambda k, ends=ends: (ends[k].failed_trials, penalise(ends[k].f, ends[k].violation, STEEP))
             )
         return ranked
 
     def _search_in_lockstep(
-        self, problem: Problem, contenders: Mapping[int, _Contender], steps: int, what: str, *, replace_best: bool
+        self, problem: Problem, contenders: Mapping[int, _Contender], steps: int, step_name: str, *, replace_best: bool
     ) -> None:
-        """Run local searches from these starting points, with `TOGETHER` of them at a time for each device."""
+        """Run local searches from these starting points, `SEARCHES_PER_DEVICE` at a time for each device."""
         tightened, bests, reports = self.tightened(problem), dict[int, Best](), 0
 
         def search(k: int, ask: Ask) -> None:
             start, keep = contenders[k].start, partial(self._record, k)
-            bests[k] = self._unmeasured(problem, start.normalised)
+            bests[k] = self._new_best(problem, start.normalised)
             self._history[k] = list(contenders[k].before)  # the longer search repeats the points of the shorter one
             search_locally(ask, bests[k], start, steps, keep, relaxed=_relaxed(problem))
 
-        def tell() -> None:
+        def report_begun() -> None:
             nonlocal reports
             begun = [*bests.values()] if replace_best or self._best is None else [self._best, *bests.values()]
             best = min(begun, key=lambda best: best.rank)
             while reports < len(bests):  # one report for each local search that has begun
-                self._report(what, reports, len(contenders), *best.so_far)
+                self._report(step_name, reports, len(contenders), *best.progress)
                 reports += 1
 
-        def measure(points: list[np.ndarray]) -> list[MeasuredWithGradients]:
-            tell()
+        def measure(points: list[np.ndarray]) -> list[MeasurementWithGradients]:
+            report_begun()
             measured = self._evaluate.measure_with_gradients(tightened, np.concatenate(points))
             return [measured.at(k) for k in range(len(points))]
 
         try:
-            run_in_lockstep([partial(search, k) for k in contenders], measure, TOGETHER * len(configure.devices()))
-            tell()
+            run_in_lockstep(
+                [partial(search, k) for k in contenders], measure, SEARCHES_PER_DEVICE * len(configure.devices())
+            )
+            report_begun()
         finally:  # also after an interrupt
             for k in contenders:
                 if k in bests:
                     self._update_best(bests[k], tightened, k, replace_best=replace_best)
                     replace_best = False
 
-    def again(self, problem: Problem) -> None:
+    def continue_best(self, problem: Problem) -> None:
         """Continue from the best results, with the trials that joined the problem."""
         for k, (start, end) in enumerate(_ranked(self._ends)[:CONTINUED_SEARCHES]):
             self._search(problem, start, Start(end.normalised, CAREFUL), self._steps, replace_best=k == 0)
@@ -299,17 +301,17 @@ class LocalSearches:
             starts: number of starting points.
             seed: seed of the points.
         """
-        self.globally = True
-        found = self.best, self._problem, self._from, self._ends
+        self.searched_globally = True
+        earlier = self.best, self._problem, self._best_start, self._ends
         try:
-            few = _few_trials(problem)
-            first = global_starting_points(self._evaluate, self.tightened(few), starts, seed, self._report)
-            self.search_locally(problem, self._promising(few, first, 1 + max(self._history, default=-1)))
+            small = _few_trials(problem)
+            first = global_starting_points(self._evaluate, self.tightened(small), starts, seed, self._report)
+            self.search_locally(problem, self._explore_starts(small, first, 1 + max(self._history, default=-1)))
         finally:  # also after an interrupt
-            if found[0].rank <= self.best.rank:
-                self._best, self._problem, self._from, self._ends = found
+            if earlier[0].rank <= self.best.rank:
+                self._best, self._problem, self._best_start, self._ends = earlier
 
-    def sweep(self, problem: Problem, scenario_gains: np.ndarray) -> None:
+    def measure_sobol_points(self, problem: Problem, scenario_gains: np.ndarray) -> None:
         """Measure Sobol points and the scenario's gains, and take the best of them. No gradients are used.
 
         Args:
@@ -318,26 +320,29 @@ class LocalSearches:
         """
         tightened = self.tightened(problem)
         normalised = np.concatenate(
-            [self._evaluate.bounds.normalise(scenario_gains)[None], spread(len(problem.names), MANY, self._rng)]
+            [
+                self._evaluate.bounds.normalise(scenario_gains)[None],
+                sobol_points(len(problem.names), SOBOL_POINTS, self._rng),
+            ]
         )
-        normalised = promising(
+        normalised = choose_promising(
             self._evaluate, tightened, normalised, 1, partial(self._report, "ranking starting points")
         )
         best, measured = self._best_of(tightened, normalised)
         self._record(0, measured)  # if the search is interrupted now, the history has this point
         self._update_best(best, tightened, 0, replace_best=True)
 
-    def _unmeasured(self, problem: Problem, normalised: np.ndarray) -> Best:
+    def _new_best(self, problem: Problem, normalised: np.ndarray) -> Best:
         """Return a `Best` before the first measured point; normalised: (gains,) of the starting point."""
         return Best(normalised, len(problem.rows), self._margin)
 
-    def _best_of(self, tightened: Problem, normalised: np.ndarray) -> tuple[Best, Measured]:
+    def _best_of(self, tightened: Problem, normalised: np.ndarray) -> tuple[Best, Measurement]:
         """Measure points (points, gains) without gradients. Return the best point and the measurement."""
-        best, measured = self._unmeasured(tightened, normalised[0]), self._evaluate.measure(tightened, normalised)
+        best, measured = self._new_best(tightened, normalised[0]), self._evaluate.measure(tightened, normalised)
         best.offer(normalised, measured)
         return best, measured
 
-    def evolve(self, problem: Problem, normalised: np.ndarray, size: tuple[int, float] = WIDELY) -> None:
+    def evolve(self, problem: Problem, normalised: np.ndarray, size: tuple[int, float] = WHOLE_BOX) -> None:
         """Search by differential evolution from a point, without gradients.
 
         Args:
@@ -349,47 +354,51 @@ class LocalSearches:
         best, _ = self._best_of(tightened, normalised[None])
         try:
             evolve(self._evaluate, tightened, best, normalised, int(self._rng.integers(2**31)),
-                   lambda done, steps: self._report("CMA-ES", done, steps, *best.so_far),
+                   lambda done, steps: self._report("differential evolution", done, steps,
+                                                    *best.progress),
                    partial(self._record, 0), size)  # fmt: skip
         finally:  # also after an interrupt
             self._update_best(best, tightened, 0, replace_best=True)
-        on_samples = np.asarray(hand_overs.on_samples(problem, self._evaluate.bounds, self.normalised))
+        on_samples = np.asarray(hand_overs.points_on_samples(problem, self._evaluate.bounds, self.normalised))
         if on_samples.size:
             best, _ = self._best_of(tightened, on_samples)
             self._update_best(best, tightened, 0, replace_best=best.infeasibility <= self.best.infeasibility)
 
-    def conflict(self, problem: Problem) -> dict[str, float | None]:
+    def find_conflicts(self, problem: Problem) -> dict[str, float | None]:
         """Return the limits that the best compromise exceeds most, and the smallest ratio that each can reach alone.
 
         The ratio is metric / limit, with every other limit kept to 0.1 %. It is None if the other limits cannot be
         kept.
         """
-        tightened, found = self.tightened(problem), dict[str, float | None]()
+        tightened, smallest_ratios = self.tightened(problem), dict[str, float | None]()
         measure = partial(self._evaluate.measure_with_gradients, tightened)
-        worst = largest(measure(self.normalised[None]).c, 0.0)[0]
+        worst = largest_ratios(measure(self.normalised[None]).c, 0.0)[0]
         for row in np.flatnonzero(worst >= 1.0 + (worst.max() - 1.0) * (1.0 - CONFLICTING)):
             others = np.arange(worst.size) != row
-            seen: list[tuple[float, float]] = []
+            ratios: list[tuple[float, float]] = []
 
-            def keep(
-                one: MeasuredWithGradients, row: int = int(row), others: np.ndarray = others, seen: list = seen
+            def record_ratios(
+                measured: MeasurementWithGradients,
+                row: int = int(row),
+                others: np.ndarray = others,
+                ratios: list = ratios,
             ) -> None:
-                each = largest(one.c, 0.0)[0]
-                seen.append((float(each[others].max(initial=0.0)), float(each[row])))
+                row_ratios = largest_ratios(measured.c, 0.0)[0]
+                ratios.append((float(row_ratios[others].max(initial=0.0)), float(row_ratios[row])))
 
-            best, relaxed = self._unmeasured(tightened, self.normalised), Relaxed(rows=[int(row)], to_the_end=True)
-            search_locally(measure, best, Start(self.normalised, CAREFUL), self._steps, keep, relaxed=relaxed)
-            kept = [ratio for rest, ratio in seen if rest <= 1.0 + 10.0 * SLACK]
+            best, relaxed = self._new_best(tightened, self.normalised), Relaxed(rows=[int(row)], beyond_limits=True)
+            search_locally(measure, best, Start(self.normalised, CAREFUL), self._steps, record_ratios, relaxed=relaxed)
+            kept = [ratio for largest_other, ratio in ratios if largest_other <= 1.0 + 10.0 * SLACK]
             margin = float(np.broadcast_to(self._margin, worst.size)[row])
-            found[problem.rows[row]] = (1.0 - margin) * min(kept) if kept else None
-        return found
+            smallest_ratios[problem.rows[row]] = (1.0 - margin) * min(kept) if kept else None
+        return smallest_ratios
 
     def _finish(self, problem: Problem) -> None:
-        self._report("last local search", 0, 1, *self.so_far)
+        self._report("last local search", 0, 1, *self.progress)
         for _ in range(HAND_OVER_ATTEMPTS):
             if not self._try_other_hand_overs(problem):
                 break
-        self._search(problem, self._from, Start(self.normalised, CAREFUL), self._steps, close=FINAL_CLOSE * CLOSE)
+        self._search(problem, self._best_start, Start(self.normalised, CAREFUL), self._steps, tolerance=FINAL_TOLERANCE)
         self._move_hand_over_to_sample(problem)
         times = [k for k, name in enumerate(problem.names) if name in TIMES]
         others = [k for k in range(len(problem.names)) if k not in times]
@@ -408,25 +417,25 @@ class LocalSearches:
         """
         tightened, current = self.tightened(problem), self.best
 
-        def judged(changes: Sequence[Sequence[int]]) -> list[Best]:
-            back = [np.isin(np.arange(scenario_gains.size), change) for change in changes]
+        def measure_resets(changes: Sequence[Sequence[int]]) -> list[Best]:
+            resets = [np.isin(np.arange(scenario_gains.size), change) for change in changes]
             bounds = self._evaluate.bounds
-            changed = [bounds.with_gains(current.normalised, scenario_gains, which) for which in back]
+            changed = [bounds.with_gains(current.normalised, scenario_gains, which) for which in resets]
             normalised = np.clip(changed, 0.0, 1.0)
             # with gradients, because this program is already compiled
             measured = self._evaluate.measure_with_gradients(tightened, normalised)
-            bests = [self._unmeasured(problem, one) for one in normalised]
+            bests = [self._new_best(problem, one) for one in normalised]
             for k, best in enumerate(bests):
                 best.offer(normalised[k : k + 1], measured.at(k))
             return bests
 
-        alone = dict(zip(indices, judged([[k] for k in indices]), strict=True))
-        order = sorted((k for k in indices if self._as_good(alone[k])), key=lambda k: alone[k].f)
+        single = dict(zip(indices, measure_resets([[k] for k in indices]), strict=True))
+        order = sorted((k for k in indices if self._is_as_good(single[k])), key=lambda k: single[k].f)
         if order:
-            together = judged([order[: k + 1] for k in range(len(order))])
-            self._best = next((best for best in reversed(together) if self._as_good(best)), current)
+            cumulative = measure_resets([order[: k + 1] for k in range(len(order))])
+            self._best = next((best for best in reversed(cumulative) if self._is_as_good(best)), current)
 
-    def _as_good(self, best: Best) -> bool:
+    def _is_as_good(self, best: Best) -> bool:
         return best.infeasibility <= self.best.infeasibility and best.f <= self.best.f + SAME_F
 
     def _try_other_hand_overs(self, problem: Problem) -> bool:
@@ -435,22 +444,22 @@ class LocalSearches:
         The noise samples in the window change with delta. F of a few hundred trials therefore has ripples of 1 % over
         delta, and a local search can end in the local minimum of a ripple.
         """
-        found, normalised = self.best, hand_overs.other_hand_overs(problem, self._evaluate.bounds, self.normalised)
-        if found.violation > 0.0 or not normalised:
+        current, normalised = self.best, hand_overs.other_hand_overs(problem, self._evaluate.bounds, self.normalised)
+        if current.violation > 0.0 or not normalised:
             return False
         tightened = self.tightened(problem)
         measured = self._evaluate.measure(tightened, np.stack(normalised))
-        multiplier = multipliers(
-            self._evaluate.measure_with_gradients(tightened, found.normalised[None]), found.normalised
+        multiplier = estimate_multipliers(
+            self._evaluate.measure_with_gradients(tightened, current.normalised[None]), current.normalised
         )
         # for small violations, the multipliers estimate F after the other gains have restored the limits
-        estimate = measured.f + np.maximum(ended(measured.c).max(axis=2, initial=-1.0), 0.0) @ multiplier
-        known = np.isfinite(estimate) & (failures(measured.c) == 0) & (measured.largest_c <= NEARLY)
-        estimate = np.where(known, estimate, np.inf)
+        estimate = measured.f + np.maximum(ignore_failures(measured.c).max(axis=2, initial=-1.0), 0.0) @ multiplier
+        admissible = np.isfinite(estimate) & (count_failures(measured.c) == 0) & (measured.largest_c <= NEARLY_ACTIVE)
+        estimate = np.where(admissible, estimate, np.inf)
         first = int(estimate.argmin())
-        if estimate[first] < found.f - SAME_F:
-            self._search(problem, self._from, Start(normalised[first], CAREFUL), self._steps)
-        return self.best is not found
+        if estimate[first] < current.f - SAME_F:
+            self._search(problem, self._best_start, Start(normalised[first], CAREFUL), self._steps)
+        return self.best is not current
 
     def _move_hand_over_to_sample(self, problem: Problem) -> None:
         """Move the hand-over of the best point onto a sample, as on a flight computer, and search the other gains.
@@ -459,9 +468,9 @@ class LocalSearches:
         """
         admissible, moved = self.best.violation == 0.0, False
         times = [k for k, name in enumerate(problem.names) if name in TIMES]
-        others = [(k, end) for k, end in _ranked(self._ends) if k != self._from]
-        for number, end in [(self._from, self.best), *others]:
-            for normalised in hand_overs.on_samples(problem, self._evaluate.bounds, end.normalised):
+        others = [(k, end) for k, end in _ranked(self._ends) if k != self._best_start]
+        for number, end in [(self._best_start, self.best), *others]:
+            for normalised in hand_overs.points_on_samples(problem, self._evaluate.bounds, end.normalised):
                 self._search(problem, number, Start(normalised, CAREFUL, times), self._steps, replace_best=not moved)
                 moved = True
             if not admissible or self.best.violation == 0.0:
@@ -473,7 +482,7 @@ class LocalSearches:
         number: int,
         start: Start,
         steps: int,
-        close: float = CLOSE,
+        tolerance: float = F_TOLERANCE,
         *,
         replace_best: bool = False,
     ) -> None:
@@ -484,13 +493,13 @@ class LocalSearches:
             number: number of the local search.
             start: starting point.
             steps: largest number of measured points.
-            close: change of F at which the search ends.
+            tolerance: change of F at which the search ends.
             replace_best: replace the best point so far, because the problem has changed.
         """
-        best, tightened = self._unmeasured(problem, start.normalised), self.tightened(problem)
+        best, tightened = self._new_best(problem, start.normalised), self.tightened(problem)
         measure, keep = partial(self._evaluate.measure_with_gradients, tightened), partial(self._record, number)
         try:
-            search_locally(measure, best, start, steps, keep, close, _relaxed(problem))
+            search_locally(measure, best, start, steps, keep, tolerance, _relaxed(problem))
         finally:  # also after an interrupt
             self._update_best(best, tightened, number, replace_best=replace_best)
 
@@ -499,11 +508,11 @@ class LocalSearches:
         if np.isfinite(best.f):
             self._ends[start] = best
         if self._best is None or (np.isfinite(best.f) and (replace_best or best.rank < self._best.rank)):
-            self._best, self._problem, self._from = best, tightened, start
+            self._best, self._problem, self._best_start = best, tightened, start
 
-    def _record(self, start: int, seen: Measured) -> None:
-        worst = np.where(failures(seen.c)[0] > 0, np.inf, largest(seen.c, self._margin)[0])
-        step = Step(start, seen.gains[0], float(seen.objective[0]), worst)
+    def _record(self, start: int, measured: Measurement) -> None:
+        worst = np.where(count_failures(measured.c)[0] > 0, np.inf, largest_ratios(measured.c, self._margin)[0])
+        step = Step(start, measured.gains[0], float(measured.objective[0]), worst)
         self._history.setdefault(start, []).append(step)
 
     def tightened(self, problem: Problem) -> Problem:
@@ -513,7 +522,7 @@ class LocalSearches:
 
 def _relaxed(problem: Problem) -> Relaxed | None:
     """Return the limits whose largest violation is minimised; None: F is minimised subject to the limits."""
-    return Relaxed(to_the_end=True) if problem.objective == LIMITS else None
+    return Relaxed(beyond_limits=True) if problem.objective == LIMITS else None
 
 
 def _ranked(ends: Mapping[int, Best]) -> list[tuple[int, Best]]:

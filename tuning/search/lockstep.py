@@ -14,10 +14,10 @@ Ask = Callable[[Any], Any]
 class _Task:
     """A task in its own thread, and its current request."""
 
-    def __init__(self, work: Callable[[Ask], None], turn: threading.Condition):
-        self._work, self._turn = work, turn
-        self.question: Any = None
-        self.waits = self.ended = False
+    def __init__(self, work: Callable[[Ask], None], condition: threading.Condition):
+        self._work, self._condition = work, condition
+        self.request: Any = None
+        self.is_waiting = self.has_ended = False
         self.error: BaseException | None = None
         self._answer: Any = None
 
@@ -29,26 +29,26 @@ class _Task:
             self._work(self._ask)
         except BaseException as error:
             self.error = error
-        with self._turn:
-            self.ended = True
-            self._turn.notify_all()
+        with self._condition:
+            self.has_ended = True
+            self._condition.notify_all()
 
-    def _ask(self, question: Any) -> Any:
-        with self._turn:
-            self.question, self.waits = question, True
-            self._turn.notify_all()
-            self._turn.wait_for(lambda: not self.waits)
+    def _ask(self, request: Any) -> Any:
+        with self._condition:
+            self.request, self.is_waiting = request, True
+            self._condition.notify_all()
+            self._condition.wait_for(lambda: not self.is_waiting)
         if isinstance(self._answer, BaseException):
             raise self._answer
         return self._answer
 
     def tell(self, answer: Any) -> None:
         """Answer the request. If the answer is an exception, it is raised inside the task."""
-        self._answer, self.waits = answer, False
+        self._answer, self.is_waiting = answer, False
 
 
 def run_in_lockstep(
-    works: Sequence[Callable[[Ask], None]], answer: Callable[[list[Any]], list[Any]], width: int
+    functions: Sequence[Callable[[Ask], None]], answer: Callable[[list[Any]], list[Any]], width: int
 ) -> None:
     """Run functions concurrently and answer their requests in batches.
 
@@ -56,7 +56,7 @@ def run_in_lockstep(
     `run_in_lockstep` returns or raises.
 
     Args:
-        works: the functions.
+        functions: the functions.
         answer: returns the answers to a list of requests. It is called in this thread as soon as every running function
             waits for an answer.
         width: largest number of functions that run at a time.
@@ -65,34 +65,34 @@ def run_in_lockstep(
         BaseException: The exception of a function or of `answer`. An exception of `answer`, such as KeyboardInterrupt,
             is first raised inside the functions that wait.
     """
-    turn = threading.Condition()
-    waiting, active, raised = [_Task(work, turn) for work in works], list[_Task](), None
+    condition = threading.Condition()
+    pending, active, failure = [_Task(work, condition) for work in functions], list[_Task](), None
 
     def all_stopped() -> bool:
-        return all(task.waits or task.ended for task in active)
+        return all(task.is_waiting or task.has_ended for task in active)
 
-    with turn:
+    with condition:
         while True:
-            raised = raised or next((task.error for task in active if task.error is not None), None)
-            active[:] = [task for task in active if not task.ended]
-            while waiting and raised is None and len(active) < width:
-                active.append(waiting.pop(0))
+            failure = failure or next((task.error for task in active if task.error is not None), None)
+            active[:] = [task for task in active if not task.has_ended]
+            while pending and failure is None and len(active) < width:
+                active.append(pending.pop(0))
                 active[-1].start()
             if not active:
                 break
             try:
-                turn.wait_for(all_stopped)
-                if raised is not None:
-                    raise raised
-                if not any(task.ended for task in active):  # else another one starts and joins this batch
-                    answers = answer([task.question for task in active])
-                    for task, one in zip(active, answers, strict=True):
-                        task.tell(one)
+                condition.wait_for(all_stopped)
+                if failure is not None:
+                    raise failure
+                if not any(task.has_ended for task in active):  # else another one starts and joins this batch
+                    answers = answer([task.request for task in active])
+                    for task, task_answer in zip(active, answers, strict=True):
+                        task.tell(task_answer)
             except BaseException as error:
-                raised = error
+                failure = error
                 for task in active:
-                    if task.waits:
-                        task.tell(raised)
-            turn.notify_all()
-    if raised is not None:
-        raise raised
+                    if task.is_waiting:
+                        task.tell(failure)
+            condition.notify_all()
+    if failure is not None:
+        raise failure

@@ -1,7 +1,7 @@
 """Stability margins of the linearised loop as constraints of a tuning problem.
 
 Each axis, time and case has its own constraint. The smallest margin alone would not be differentiable where two margins
-are equal. Read `ask` first, which selects the loops, and then `rows`, which computes the constraints.
+are equal. Read `build_required_margins` first, which selects the loops, and then `margin_constraints`.
 """
 
 from collections.abc import Callable
@@ -52,7 +52,7 @@ class RequiredMargins:
         return replace(self, limits=self.limits * factor)
 
 
-def ask(ready: Study, bounds: Bounds, seed: int) -> RequiredMargins | None:
+def build_required_margins(ready: Study, bounds: Bounds, seed: int) -> RequiredMargins | None:
     """Return the margins that a scenario requires, or None if it requires none.
 
     If dispersions change the loop, the constrained loops are those of the worst trials for the scenario's gains. The
@@ -76,18 +76,18 @@ def ask(ready: Study, bounds: Bounds, seed: int) -> RequiredMargins | None:
         metrics=tuple(one.metric for one in ready.margins),
         names=bounds.names,
     )
-    some = _of_trials(asked, np.arange(CASES)) if margin_verdicts.differ(asked.dispersion) else asked
-    rows_with_derivatives.prepare(some, bounds.scale, np.zeros((len(configure.processors()), len(bounds.names))))
-    return hardest(asked, np.asarray(gain_names.present_values(ready.parts, bounds.names)))[0]
+    example = _with_trials(asked, np.arange(CASES)) if margin_verdicts.has_different_loops(asked.dispersion) else asked
+    constraints_on_devices.prepare(example, bounds.scale, np.zeros((len(configure.processors()), len(bounds.names))))
+    return select_hardest_trials(asked, np.asarray(gain_names.present_values(ready.parts, bounds.names)))[0]
 
 
-def _of_trials(asked: RequiredMargins, trials: np.ndarray) -> RequiredMargins:
+def _with_trials(asked: RequiredMargins, trials: np.ndarray) -> RequiredMargins:
     """Return a copy with the loops of these trials."""
-    drawn = montecarlo.coordinates(asked.dispersion, asked.seed, jnp.asarray(trials, dtype=jnp.uint32))
-    return replace(asked, coordinates=drawn)
+    coordinates = montecarlo.coordinates(asked.dispersion, asked.seed, jnp.asarray(trials, dtype=jnp.uint32))
+    return replace(asked, coordinates=coordinates)
 
 
-def hardest(asked: RequiredMargins, gains: Float[np.ndarray, " gains"]) -> tuple[RequiredMargins, float]:
+def select_hardest_trials(asked: RequiredMargins, gains: Float[np.ndarray, " gains"]) -> tuple[RequiredMargins, float]:
     """Select the `CASES` trials with the worst margins for these gains, (gains,).
 
     If no dispersion changes the loop, all trials have the nominal loop, and nothing is selected.
@@ -95,18 +95,20 @@ def hardest(asked: RequiredMargins, gains: Float[np.ndarray, " gains"]) -> tuple
     Returns:
         The required margins for the loops of these trials, and the largest violation ratio of all trials, at least 0.
     """
-    if not margin_verdicts.differ(asked.dispersion):
+    if not margin_verdicts.has_different_loops(asked.dispersion):
         return asked, 0.0
     parts, seed = with_gains(asked.parts, dict(zip(asked.names, gains, strict=True))), int(asked.seed)
     limits = dict(zip(asked.metrics, np.asarray(asked.required).tolist(), strict=True))
-    each = margin_verdicts.worst(parts, asked.dispersion, seed, np.arange(margin_verdicts.TRIALS), limits, CASES)
-    ratios = [margin_verdicts.signed_violation_ratio(each[name], limit, name) for name, limit in limits.items()]
-    near = np.max(np.nan_to_num(ratios, nan=RATIO_OF_NAN, neginf=-1e9), axis=0)
-    return _of_trials(asked, np.argsort(-near, kind="stable")[:CASES]), max(float(near.max()), 0.0)
+    by_trial = margin_verdicts.worst_margins(
+        parts, asked.dispersion, seed, np.arange(margin_verdicts.TRIALS), limits, CASES
+    )
+    ratios = [margin_verdicts.signed_violation_ratio(by_trial[name], limit, name) for name, limit in limits.items()]
+    ratio = np.max(np.nan_to_num(ratios, nan=RATIO_OF_NAN, neginf=-1e9), axis=0)
+    return _with_trials(asked, np.argsort(-ratio, kind="stable")[:CASES]), max(float(ratio.max()), 0.0)
 
 
-def rows(
-    asked: RequiredMargins, gains: Float[Array, " gains"], runs: linear.Nominal
+def margin_constraints(
+    asked: RequiredMargins, gains: Float[Array, " gains"], runs: linear.NominalRun
 ) -> Float[Array, "margins entries"]:
     """Return the constraints c of the margins, which are met if c <= 0.
 
@@ -123,26 +125,28 @@ def rows(
     """
     late = margin_verdicts.DELAY in asked.metrics
 
-    def loops_of(parts: Parts, run: linear.Nominal) -> Loop:
-        return run_margins.judged_loops(parts, run, late=late)[0]
+    def loops_of(parts: Parts, run: linear.NominalRun) -> Loop:
+        return run_margins.judged_loops(parts, run, fractional_delays=late)[0]
 
-    each = _by_case(asked, gains, loops_of, runs)
-    loops = jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), each)
-    values = margins.compute_each(loops, with_delay=late).each()
+    loops_by_case = _map_cases(asked, gains, loops_of, runs)
+    loops = jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), loops_by_case)
+    values = margins.compute_each(loops, with_delay=late).by_name()
     ratios = [
         violation_ratio(values[name].reshape(-1), limit, at_least=MARGINS[name].at_least)
         for name, limit in zip(asked.metrics, asked.required, strict=True)
     ]
-    near = jnp.stack([jnp.where(jnp.isnan(ratio), RATIO_OF_NAN, ratio) for ratio in ratios])
-    return near / asked.limits[:, None] - 1.0
+    finite_ratios = jnp.stack([jnp.where(jnp.isnan(ratio), RATIO_OF_NAN, ratio) for ratio in ratios])
+    return finite_ratios / asked.limits[:, None] - 1.0
 
 
-def nominal_runs(asked: RequiredMargins, gains: Float[Array, " gains"]) -> linear.Nominal:
+def nominal_runs(asked: RequiredMargins, gains: Float[Array, " gains"]) -> linear.NominalRun:
     """Return the nominal run of each case, cases on the first axis, or the run of the nominal parts without cases."""
-    return _by_case(asked, gains, linear.nominal)
+    return _map_cases(asked, gains, linear.simulate_nominal)
 
 
-def _by_case(asked: RequiredMargins, gains: Float[Array, " gains"], of: Callable[..., Any], *by_case: Any) -> Any:
+def _map_cases(
+    asked: RequiredMargins, gains: Float[Array, " gains"], function: Callable[..., Any], *arguments: Any
+) -> Any:
     """Apply `of` to the parts of each case and its entries of `by_case`. Return arrays with cases on the first axis.
 
     The cases are computed one after the other. With a batch axis for the inertia, XLA aborts the process for some sets
@@ -150,13 +154,17 @@ def _by_case(asked: RequiredMargins, gains: Float[Array, " gains"], of: Callable
     """
     parts = with_gains(asked.parts, dict(zip(asked.names, gains, strict=True)))
     if asked.coordinates:
-        return jax.lax.map(lambda one: of(asked.dispersion.at(parts, one[0]), *one[1:]), (asked.coordinates, *by_case))
-    known = jax.tree.map(lambda v: v[0], by_case)
-    return jax.tree.map(lambda v: v[None], of(parts, *known))
+        return jax.lax.map(
+            lambda case: function(asked.dispersion.at(parts, case[0]), *case[1:]), (asked.coordinates, *arguments)
+        )
+    first = jax.tree.map(lambda v: v[0], arguments)
+    return jax.tree.map(lambda v: v[None], function(parts, *first))
 
 
-def with_derivatives(asked: RequiredMargins, scale: Scale, normalised: Float[Array, " gains"]) -> tuple[Array, Array]:
-    """Return the constraints `rows` and their derivatives with respect to normalised gains.
+def constraints_with_derivatives(
+    asked: RequiredMargins, scale: Scale, normalised: Float[Array, " gains"]
+) -> tuple[Array, Array]:
+    """Return the constraints `margin_constraints` and their derivatives with respect to normalised gains.
 
     The nominal runs are differentiated in lanes, one for each gain.
 
@@ -172,28 +180,28 @@ def with_derivatives(asked: RequiredMargins, scale: Scale, normalised: Float[Arr
     def differentiable_runs(normalised: Array) -> tuple[Any, Any]:
         runs = nominal_runs(asked, scale.gains(normalised))
         return tuple(
-            jax.tree.map(lambda v, kept=kept: v if _has_derivatives(v) is kept else None, runs)
+            jax.tree.map(lambda v, kept=kept: v if _is_differentiable(v) is kept else None, runs)
             for kept in (True, False)
         )
 
-    def judged(normalised: Array, numbers: Any) -> Array:
-        def either(one: Any, other: Any) -> Any:
+    def judge_runs(normalised: Array, inexact: Any) -> Array:
+        def merge(one: Any, other: Any) -> Any:
             return other if one is None else one
 
-        runs = jax.tree.map(either, numbers, others, is_leaf=lambda v: v is None)
-        return rows(asked, scale.gains(normalised), runs)
+        runs = jax.tree.map(merge, inexact, constant, is_leaf=lambda v: v is None)
+        return margin_constraints(asked, scale.gains(normalised), runs)
 
     axes = jnp.eye(normalised.size)
     each = lanes.vmap(lambda axis: jax.jvp(differentiable_runs, (normalised,), (axis,), has_aux=True))(axes)
-    (numbers, others), moved = jax.tree.map(lambda v: v[0], (each[0], each[2])), each[1]
-    return jax.vmap(lambda *by: jax.jvp(judged, (normalised, numbers), by), out_axes=(None, -1))(axes, moved)
+    (inexact, constant), derivatives = jax.tree.map(lambda v: v[0], (each[0], each[2])), each[1]
+    return jax.vmap(lambda *by: jax.jvp(judge_runs, (normalised, inexact), by), out_axes=(None, -1))(axes, derivatives)
 
 
-def _has_derivatives(leaf: Any) -> bool:
+def _is_differentiable(leaf: Any) -> bool:
     return bool(jnp.issubdtype(leaf.dtype, jnp.inexact))
 
 
-def of_points(
+def constraints_at_points(
     asked: RequiredMargins, scale: Scale, normalised: Float[np.ndarray, "points gains"]
 ) -> dict[str, np.ndarray]:
     """Return the constraints and their derivatives with respect to normalised gains, at many points.
@@ -208,13 +216,13 @@ def of_points(
     """
     count = len(configure.processors())
     padded = np.resize(normalised, (-(-len(normalised) // count) * count, normalised.shape[1]))
-    each = [rows_with_derivatives(asked, scale, padded[k : k + count]) for k in range(0, len(padded), count)]
+    each = [constraints_on_devices(asked, scale, padded[k : k + count]) for k in range(0, len(padded), count)]
     return jax.tree.map(lambda *v: np.concatenate(v)[: len(normalised)], *each)
 
 
 @programs.jit(title="the gradients of the margins")
-def rows_with_derivatives(asked: RequiredMargins, scale: Scale, normalised: Array) -> dict[str, Array]:
-    """Return the result of `of_points` for as many points as there are devices, with one point on each device.
+def constraints_on_devices(asked: RequiredMargins, scale: Scale, normalised: Array) -> dict[str, Array]:
+    """Return the result of `constraints_at_points` for one point on each device.
 
     Args:
         asked: the required margins.
@@ -223,7 +231,7 @@ def rows_with_derivatives(asked: RequiredMargins, scale: Scale, normalised: Arra
     """
 
     def on_device(normalised: Array) -> dict[str, Array]:
-        c, gradient = with_derivatives(asked, scale, normalised[0])
+        c, gradient = constraints_with_derivatives(asked, scale, normalised[0])
         return {"c": c[None], "c_gradient": jnp.nan_to_num(gradient)[None]}
 
-    return montecarlo.over_devices(on_device, normalised, normalised.shape[0])
+    return montecarlo.map_over_devices(on_device, normalised, normalised.shape[0])

@@ -10,7 +10,7 @@ import numpy as np
 
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
 from ptsmc_jax.scenario import free_gains
-from ptsmc_jax.scenario.gain_bounds import wide
+from ptsmc_jax.scenario.gain_bounds import is_log_scaled
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation.rollout import Parts
 from ptsmc_jax.theory import envelopes
@@ -19,7 +19,7 @@ from tuning.search import gains as gain_names
 TIMES, TIME_DIGITS = ("delta", "t_f"), 12  # with fewer digits, a hand-over may move past its sample
 
 MOST_OF_UPPER = 0.5  # largest lower bound of sign_width relative to its upper bound
-NEAR = 0.01  # a gain within this fraction of its interval from a bound counts as on the bound
+BOUND_TOLERANCE = 0.01  # a gain within this fraction of its interval from a bound counts as on the bound
 
 
 @pytree
@@ -29,10 +29,12 @@ class Scale:
 
     lower: Leaf | np.ndarray  # (gains,)
     upper: Leaf | np.ndarray  # (gains,)
-    hop: Leaf | np.ndarray  # number that moves the lower bound of sign_width, see `Bounds`
+    jump: Leaf | np.ndarray  # number that moves the lower bound of sign_width, see `Bounds`
     log: tuple[bool, ...] = field(metadata={"static": True})  # gains that are searched on a log scale
-    width: int | None = field(metadata={"static": True})  # index of a sign_width whose lower bound moves with `hop`
-    observers: tuple[int, ...] = field(metadata={"static": True})  # indices of the observer's gains
+    width_index: int | None = field(
+        metadata={"static": True}
+    )  # index of a sign_width whose lower bound moves with `jump`
+    observer_indices: tuple[int, ...] = field(metadata={"static": True})  # indices of the observer's gains
 
     def gains(self, normalised: Any) -> Any:
         """Return the gains of normalised gains, (gains,), as a NumPy or JAX array.
@@ -42,22 +44,24 @@ class Scale:
         xp, low, high, log = normalised.__array_namespace__(), self.lower, self.upper, np.asarray(self.log)
         ratio = xp.where(log, high, 1.0) / xp.where(log, low, 1.0)
         gains = xp.where(log, low * ratio**normalised, low + (high - low) * normalised)
-        if self.width is None:
+        if self.width_index is None:
             return gains
-        k, least = self.width, self.least_width(gains)
+        k, least = self.width_index, self.least_width(gains)
         return xp.where(np.arange(len(self.log)) == k, least * (high[k] / least) ** normalised[k], gains)
 
     def least_width(self, gains: Any) -> Any:
         """Return the lower bound of sign_width. It depends only on the observer's gains among the gains, (gains,)."""
-        least = self.hop / gains[np.asarray(self.observers)].min()
-        return gains.__array_namespace__().clip(least, self.lower[self.width], MOST_OF_UPPER * self.upper[self.width])
+        least = self.jump / gains[np.asarray(self.observer_indices)].min()
+        return gains.__array_namespace__().clip(
+            least, self.lower[self.width_index], MOST_OF_UPPER * self.upper[self.width_index]
+        )
 
 
 @dataclass(frozen=True)
 class Bounds:
     """Bounds of the free gains. A gain that may vary more than tenfold is searched on a log scale.
 
-    The lower bound of sign_width is raised to hop / observer_gain if that is larger. Below this boundary-layer
+    The lower bound of sign_width is raised to jump / observer_gain if that is larger. Below this boundary-layer
     thickness, the sampled switching term jumps from one side of s = 0 to the other. The thickness is proportional to
     K2, which is inversely proportional to the observer's gain.
     """
@@ -65,20 +69,20 @@ class Bounds:
     names: tuple[str, ...]
     lower: tuple[float, ...]
     upper: tuple[float, ...]
-    hop: float = 0.0  # [unit of s times unit of observer_gain]; 0: the lower bound of sign_width is fixed
+    jump: float = 0.0  # [unit of s times unit of observer_gain]; 0: the lower bound of sign_width is fixed
 
     @property
     def logarithmic(self) -> np.ndarray:
         """Whether each gain is searched on a log scale, (gains,) bool."""
-        return wide(np.asarray(self.lower), np.asarray(self.upper))
+        return is_log_scaled(np.asarray(self.lower), np.asarray(self.upper))
 
     @property
     def scale(self) -> Scale:
         """The map from normalised gains to gains, for compiled programs."""
         observers = tuple(k for k, name in enumerate(self.names) if gain_names.base(name) == "observer_gain")
-        width = self.names.index("sign_width") if self.hop else None
+        width = self.names.index("sign_width") if self.jump else None
         log = tuple(map(bool, self.logarithmic))
-        return Scale(np.asarray(self.lower), np.asarray(self.upper), np.asarray(self.hop), log, width, observers)
+        return Scale(np.asarray(self.lower), np.asarray(self.upper), np.asarray(self.jump), log, width, observers)
 
     def gains(self, normalised: Any) -> Any:
         """Return the gains of normalised gains, (gains,), see `Scale.gains`."""
@@ -99,27 +103,27 @@ class Bounds:
             gains: (gains,) the new values.
             which: (gains,) bool, the gains to replace.
         """
-        both = np.where(which, self.normalise(gains), normalised)
-        if self.hop:
+        combined = np.where(which, self.normalise(gains), normalised)
+        if self.jump:
             width = self.names.index("sign_width")
-            both[width] = self._normalise(np.where(which, gains, self.gains(normalised)))[width]
-        return both
+            combined[width] = self._normalise(np.where(which, gains, self.gains(normalised)))[width]
+        return combined
 
     def _normalise(self, gains: np.ndarray) -> np.ndarray:
         """Return the normalised gains of gains, (gains,), without clipping."""
         scale = self.scale
         low, high, log = scale.lower.copy(), scale.upper, np.asarray(scale.log)
-        if scale.width is not None:
-            low[scale.width] = scale.least_width(gains)
+        if scale.width_index is not None:
+            low[scale.width_index] = scale.least_width(gains)
         ratio = np.where(log, high, np.e) / np.where(log, low, 1.0)
         logarithms = np.log(np.maximum(np.where(log, gains, 1.0) / np.where(log, low, 1.0), 1e-300))
         return np.where(log, logarithms / np.log(ratio), (gains - low) / (high - low))
 
     def at_bound(self, gains: np.ndarray) -> dict[str, str]:
-        """Return "lower" or "upper" by name for each gain, (gains,), that is on a bound to within `NEAR`."""
-        normalised_by_name = dict(zip(self.names, self.normalise(gains).tolist(), strict=True))
-        return {name: "lower" if normalised < NEAR else "upper" for name, normalised in normalised_by_name.items()
-                if not NEAR <= normalised <= 1.0 - NEAR}  # fmt: skip
+        """Return "lower" or "upper" by name for each gain, (gains,), that is on a bound to within `BOUND_TOLERANCE`."""
+        by_name = dict(zip(self.names, self.normalise(gains).tolist(), strict=True))
+        return {name: "lower" if normalised < BOUND_TOLERANCE else "upper" for name, normalised in by_name.items()
+                if not BOUND_TOLERANCE <= normalised <= 1.0 - BOUND_TOLERANCE}  # fmt: skip
 
     def rounded(self, gains: np.ndarray, digits: int) -> dict[str, float]:
         """Return gains (gains,) by name, rounded to significant digits and kept within the bounds.
@@ -131,24 +135,24 @@ class Bounds:
         return {name: min(max(float(f"{gain:.{shown[name]}g}"), low), high) for name, gain, low, high in within}
 
 
-def of_scenario(scenario: Scenario, parts: Parts) -> Bounds:
+def bounds_of_scenario(scenario: Scenario, parts: Parts) -> Bounds:
     """Return the bounds of the free gains of a validated scenario, which has these parts."""
-    names = gain_names.named(scenario)
+    names = gain_names.free_gain_names(scenario)
     intervals = {name: scenario.search.bounds[gain_names.base(name)] for name in names}
-    hop = 0.0
+    jump = 0.0
     if "sign_width" in names and _can_overshoot(scenario, parts):
-        hop = envelopes.narrowest_sign(parts, scenario.loop.period) / 2
+        jump = envelopes.smallest_sign_width(parts, scenario.loop.period) / 2
         if parts.observer.linear and any(gain_names.base(name) == "observer_gain" for name in names):
-            hop *= float(parts.observer.gain.min())
+            jump *= float(parts.observer.gain.min())
         else:  # the lower bound of sign_width does not depend on a free gain
             low, high = intervals["sign_width"]
-            intervals["sign_width"], hop = (min(max(low, hop), MOST_OF_UPPER * high), high), 0.0
+            intervals["sign_width"], jump = (min(max(low, jump), MOST_OF_UPPER * high), high), 0.0
     lower, upper = zip(*intervals.values(), strict=True)
-    return Bounds(names, lower, upper, hop)
+    return Bounds(names, lower, upper, jump)
 
 
 def _can_overshoot(scenario: Scenario, parts: Parts) -> bool:
     """Return whether sign_width has the default lower bound and the sampled switching term can overshoot."""
     if not scenario.sampled or not parts.controller.prescribed:
         return False
-    return scenario.search.bounds["sign_width"][0] == free_gains.usual(scenario, "sign_width")[0]
+    return scenario.search.bounds["sign_width"][0] == free_gains.usual_bounds(scenario, "sign_width")[0]

@@ -23,8 +23,7 @@ from ptsmc_jax.scenario.tables import LIMITS as LIMITS
 from ptsmc_jax.scenario.tables import T_F as T_F
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.catalogues import POINTING
-from ptsmc_jax.simulation.requirements import Requirement
-from ptsmc_jax.simulation.requirements import violation_ratio as near
+from ptsmc_jax.simulation.requirements import Requirement, violation_ratio
 from ptsmc_jax.simulation.rollout import Parts
 from tuning.search.gains import with_gains
 from tuning.search.margin_rows import RequiredMargins
@@ -32,7 +31,7 @@ from tuning.search.simulations import Batch
 
 FAILED = 1e9  # metric, and metric / limit, of a failed trial: larger than those of any completed trial
 LEAST = 1e-300  # smallest argument of a logarithm, so that it is finite
-DRAWN = 128  # trials whose dispersions are computed in one call
+CALL_SIZE = 128  # trials whose dispersions are computed in one call
 
 
 @pytree
@@ -91,7 +90,7 @@ class Problem(Rules):
     def batch(self) -> Batch:
         """The trials to simulate, with their parts and dispersions."""
         trials, coordinates = np.asarray(self.trials), jax.tree.map(np.asarray, self.coordinates)
-        names = watched(self)
+        names = needed_metrics(self)
         pointing = tuple(name for name in POINTING if name in names)
         return Batch(self.parts, self.dispersion, self.seed, self.names, trials, coordinates, pointing)
 
@@ -130,8 +129,8 @@ def problem(
         requirements: requirements on the metrics.
         may_break: number of trials that may break each limit, or None for a limit on every trial. By default, every
             trial must keep every limit.
-        banded: whether a band of trials will represent each limit, see `confirm.may_break`. Every training trial must
-            keep the limit until the band joins.
+        banded: whether a band of trials will represent each limit, see `confirm.allowed_in_training`. Every training
+            trial must keep the limit until the band joins.
         others: further fields of `Problem`.
     """
     empty = Problem(
@@ -148,13 +147,13 @@ def problem(
         metrics=tuple(r.metric for r in requirements),
         may_break=may_break or (None,) * len(requirements),
     )
-    alone = kept_by_every_trial(empty) | np.asarray(banded or False, dtype=bool)
-    posed = with_trials(empty, trials, counted=alone)
-    return replace(posed, quantile_sample=~posed.counted, **others)
+    kept_by_all = kept_by_every_trial(empty) | np.asarray(banded or False, dtype=bool)
+    with_training_trials = with_trials(empty, trials, counted=kept_by_all)
+    return replace(with_training_trials, quantile_sample=~with_training_trials.counted, **others)
 
 
 def coordinates_of(dispersion: Dispersion, seed: int, trials: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the random numbers of the dispersions for trials. One program computes `DRAWN` trials at a time.
+    """Return the random numbers of the dispersions for trials. One program computes `CALL_SIZE` trials at a time.
 
     Args:
         dispersion: the dispersions.
@@ -164,24 +163,24 @@ def coordinates_of(dispersion: Dispersion, seed: int, trials: np.ndarray) -> dic
     Returns:
         Random numbers by the name of the dispersion, (trials, numbers).
     """
-    numbers = np.resize(np.asarray(trials, dtype=np.uint32), max(1, -(-len(trials) // DRAWN)) * DRAWN)
+    numbers = np.resize(np.asarray(trials, dtype=np.uint32), max(1, -(-len(trials) // CALL_SIZE)) * CALL_SIZE)
     calls = [
-        montecarlo.coordinates(dispersion, jnp.uint32(seed), jnp.asarray(numbers[k : k + DRAWN]))
-        for k in range(0, numbers.size, DRAWN)
+        montecarlo.coordinates(dispersion, jnp.uint32(seed), jnp.asarray(numbers[k : k + CALL_SIZE]))
+        for k in range(0, numbers.size, CALL_SIZE)
     ]
     return jax.tree.map(lambda *many: np.concatenate(many)[: len(trials)], *calls)
 
 
-def replaced(array: Leaf | np.ndarray, at: Any, values: Any) -> np.ndarray:
+def replace_entries(array: Leaf | np.ndarray, index: Any, values: Any) -> np.ndarray:
     """Return a copy of an array with other values at some indices.
 
     Args:
         array: array of a problem.
-        at: index into the array, as in `array[at]`.
+        index: index into the array, as in `array[index]`.
         values: the new values.
     """
     changed = np.array(array)
-    changed[at] = values
+    changed[index] = values
     return changed
 
 
@@ -212,23 +211,23 @@ def fewer_trials(problem: Problem, averaged: int) -> Problem:
     """
     if averaged >= problem.averaged:
         return problem
-    fewer = np.r_[:averaged, problem.averaged : problem.trials.size]
+    selected = np.r_[:averaged, problem.averaged : problem.trials.size]
 
-    def scaled(count: int) -> int:
+    def scale_count(count: int) -> int:
         return max(1, math.ceil(count * averaged / problem.averaged))
 
-    def allowed(count: int | None, averaged_are_among: bool) -> int | None:
-        return averaged - scaled(problem.averaged - count) if count is not None and averaged_are_among else count
+    def scale_allowed(count: int | None, sample_is_averaged: bool) -> int | None:
+        return averaged - scale_count(problem.averaged - count) if count is not None and sample_is_averaged else count
 
     return replace(
         problem,
-        trials=problem.trials[fewer],
-        quantile_sample=problem.quantile_sample[:, fewer],
-        counted=problem.counted[:, fewer],
-        coordinates={name: v[fewer] for name, v in problem.coordinates.items()},
+        trials=problem.trials[selected],
+        quantile_sample=problem.quantile_sample[:, selected],
+        counted=problem.counted[:, selected],
+        coordinates={name: v[selected] for name, v in problem.coordinates.items()},
         averaged=averaged,
-        may_break=tuple(map(allowed, problem.may_break, np.asarray(problem.quantile_sample)[:, 0].tolist())),
-        tail=None if problem.tail is None else scaled(problem.tail),
+        may_break=tuple(map(scale_allowed, problem.may_break, np.asarray(problem.quantile_sample)[:, 0].tolist())),
+        tail=None if problem.tail is None else scale_count(problem.tail),
     )
 
 
@@ -237,7 +236,7 @@ def kept_by_every_trial(problem: Problem) -> np.ndarray:
     return np.asarray([allowed is None for allowed in problem.may_break], dtype=bool)
 
 
-def watched(problem: Problem) -> tuple[str, ...]:
+def needed_metrics(problem: Problem) -> tuple[str, ...]:
     """Return the names of the metrics of a problem: objective, peak torque, then requirements."""
     objective = "window_error" if problem.objective in (T_F, LIMITS) else problem.objective
     return (objective, "peak_torque", *problem.metrics)
@@ -252,18 +251,18 @@ def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Arr
         problem: the tuning problem.
         gains: (gains,) values of the free gains.
     """
-    parts, names = with_gains(problem.parts, dict(zip(problem.names, gains, strict=True))), watched(problem)
+    parts, names = with_gains(problem.parts, dict(zip(problem.names, gains, strict=True))), needed_metrics(problem)
 
-    def simulated(case: tuple[Array, Coordinates]) -> tuple[Array, Array]:
+    def simulate_trial(case: tuple[Array, Coordinates]) -> tuple[Array, Array]:
         trial, coordinates = case
         metrics, status, *_ = montecarlo.one(parts, problem.dispersion, problem.seed, trial, coordinates)
         return jnp.stack([getattr(metrics, name) for name in names]), status
 
-    return judge(problem.rules, gains, *montecarlo.blocks(simulated, (problem.trials, problem.coordinates)))
+    return judge(problem.rules, gains, *montecarlo.map_in_blocks(simulate_trial, (problem.trials, problem.coordinates)))
 
 
 def judge(
-    rules: Rules, gains: Float[Array, " gains"], metrics: Float[Array, "trials watched"], status: Array
+    rules: Rules, gains: Float[Array, " gains"], metrics: Float[Array, "trials metrics"], status: Array
 ) -> tuple[Array, Array, Array]:
     """Return F, c and ln of the objective from the metrics and statuses of all trials.
 
@@ -281,15 +280,18 @@ def judge(
     Args:
         rules: the rules.
         gains: (gains,) values of the free gains.
-        metrics: (trials, watched) metrics of all trials, in the order of `watched`.
+        metrics: (trials, metrics) metrics of all trials, in the order of `needed_metrics`.
         status: (trials,) status codes, see `rollout.STATUS`.
 
     Returns:
         F, c (requirements, trials), and ln of the objective.
     """
     objective, torque, *limited = metrics.T
-    values, torques = (judged(v, status)[: rules.averaged] for v in (objective, torque))
-    excesses = [judged(near(one, rules.limits[k], at_least=False), status) - 1.0 for k, one in enumerate(limited)]
+    values, torques = (mark_failures(v, status)[: rules.averaged] for v in (objective, torque))
+    excesses = [
+        mark_failures(violation_ratio(one, rules.limits[k], at_least=False), status) - 1.0
+        for k, one in enumerate(limited)
+    ]
     rows = [_constraint(rules, k, one) for k, one in enumerate(excesses)]
     constraints = jnp.stack(rows) if rows else jnp.zeros((0, metrics.shape[0]))
     if rules.objective == T_F:
@@ -307,31 +309,31 @@ def judge(
 
 def log_largest(constraints: Array) -> Array:
     """Return ln of the largest metric / limit of the completed trials, from c, (rows, trials)."""
-    ended = jnp.where(constraints < FAILED - 1.0, constraints, -1.0)
-    return jnp.log(jnp.maximum(1.0 + jnp.max(ended, initial=-1.0), LEAST))
+    completed = jnp.where(constraints < FAILED - 1.0, constraints, -1.0)
+    return jnp.log(jnp.maximum(1.0 + jnp.max(completed, initial=-1.0), LEAST))
 
 
-def judged(value: Array, status: Array) -> Array:
+def mark_failures(value: Array, status: Array) -> Array:
     """Return the values of completed trials, and `FAILED` for trials that failed or lack a value, (trials,)."""
-    ended = (status == rollout.OK) | (status == rollout.NOT_CONVERGED)
-    return jnp.where(ended & ~jnp.isnan(value), value, FAILED)
+    completed = (status == rollout.OK) | (status == rollout.NOT_CONVERGED)
+    return jnp.where(completed & ~jnp.isnan(value), value, FAILED)
 
 
-def ended(c: np.ndarray) -> np.ndarray:
+def ignore_failures(c: np.ndarray) -> np.ndarray:
     """Return constraints with c = -1 for failed trials. Gains may be unable to change a failure."""
     return np.where(c < FAILED - 1.0, c, -1.0)
 
 
-def failures(c: np.ndarray) -> np.ndarray:
+def count_failures(c: np.ndarray) -> np.ndarray:
     """Return the number of trials that fail or lack a metric, (points,), from c, (points, requirements, trials)."""
     return np.sum(np.any(c >= FAILED - 1.0, axis=1), axis=1)
 
 
 def _log_statistic(values: Float[Array, " trials"], tail: int | None, statistic: str) -> Float[Array, ""]:
     """Return ln of a statistic of the completed trials, or of the `tail` worst of them, or ln `FAILED` without any."""
-    ends = values < FAILED
-    count = jnp.sum(ends)
-    counted = jnp.where(ends, values, 0.0)
+    completed = values < FAILED
+    count = jnp.sum(completed)
+    counted = jnp.where(completed, values, 0.0)
     if tail is not None:
         counted, count = jax.lax.top_k(counted, tail)[0], jnp.minimum(count, tail)
     if statistic == "quantile":
@@ -343,9 +345,9 @@ def _log_statistic(values: Float[Array, " trials"], tail: int | None, statistic:
 
 def _constraint(rules: Rules, row: int, constraints: Float[Array, " trials"]) -> Float[Array, " trials"]:
     """Return c of one limit. It is unchanged for counted trials, and reduced for sampled trials that may break it."""
-    alone, may_break = jnp.where(rules.counted[row], constraints, -1.0), rules.may_break[row]
+    of_counted, may_break = jnp.where(rules.counted[row], constraints, -1.0), rules.may_break[row]
     if may_break is None:
-        return alone
-    together = jnp.where(rules.quantile_sample[row], constraints, -1.0)
-    last = jax.lax.top_k(together, may_break + 1)[0][-1]
-    return jnp.maximum(alone, jnp.minimum(together, last))
+        return of_counted
+    of_sample = jnp.where(rules.quantile_sample[row], constraints, -1.0)
+    last = jax.lax.top_k(of_sample, may_break + 1)[0][-1]
+    return jnp.maximum(of_counted, jnp.minimum(of_sample, last))

@@ -13,7 +13,7 @@ import numpy as np
 from ptsmc_jax.simulation.requirements import Requirement
 from tuning.search import confirm
 from tuning.search.evaluate import Evaluator
-from tuning.search.evolution import NEARBY
+from tuning.search.evolution import NEAR_BEST
 from tuning.search.local_searches import LocalSearches, Step
 from tuning.search.objective import Problem
 from tuning.search.progress import Report
@@ -22,7 +22,7 @@ from tuning.search.worst import Hardest
 
 Announce = Callable[[str], None]  # reports the name of the current step
 
-GLOBALLY = "no gains that meet every requirement are found yet: searching globally"
+GLOBAL_SEARCH = "no gains that meet every requirement are found yet: searching globally"
 HOPELESS = 1.1  # if the best gains have a larger metric / limit, no harder trials are added, because they cannot help
 
 
@@ -49,16 +49,16 @@ class Search:
     normalised: np.ndarray  # (gains,) normalised gains of the best point
     value: float  # objective over the training trials
     worst: np.ndarray  # (requirements,) largest metric / limit of the best point; infinite if a trial fails
-    ended: np.ndarray  # (requirements,) largest metric / limit over the completed trials
+    worst_completed: np.ndarray  # (requirements,) largest metric / limit over the completed trials
     ends: list[np.ndarray]  # normalised gains of the final points of the local searches, the best first
     history: list[Step]  # measured points, by local search and step
     problem: Problem  # tuning problem with the trials that joined
     rounds: int = 0  # number of searches that were repeated with harder trials
     margins: dict[str, float] = field(default_factory=dict)  # relative tightening of the limit of each metric
     violation: float = 0.0  # relative violation of the tightened limits at the best point, as in progress reports
-    # if no gains meet every requirement: the limits that conflict, see `LocalSearches.conflict`
+    # if no gains meet every requirement: the limits that conflict, see `LocalSearches.find_conflicts`
     conflict: dict[str, float | None] = field(default_factory=dict)
-    globally: bool = False  # whether a global search of the whole box followed
+    searched_globally: bool = False  # whether a global search of the whole box followed
     hardest: Hardest | None = None  # worst case of the gains; None: no requirement on every trial
     counts: list[confirm.Count] = field(default_factory=list)  # confirmations of quantile requirements
     interrupted: bool = False
@@ -94,36 +94,36 @@ def search(
     with_gradients = settings.with_gradients
     rounds = Rounds(evaluate, problem, requirements, robust=settings.robust)
     margins = {row: max(settings.margins.get(row, 0.0), rounds.margin) for row in rounds.problem.rows}
-    kept = np.asarray([*margins.values()])
-    local_searches = LocalSearches(evaluate, kept, settings.steps, np.random.default_rng(settings.seed), report)
+    tightening = np.asarray([*margins.values()])
+    local_searches = LocalSearches(evaluate, tightening, settings.steps, np.random.default_rng(settings.seed), report)
     interrupted, conflict = False, dict[str, float | None]()
 
-    def tell(what: str) -> None:
-        report(what, 0, 0, *local_searches.so_far)
+    def announce(what: str) -> None:
+        report(what, 0, 0, *local_searches.progress)
 
     try:
         if with_gradients:
             prepare()
-            _search_with_gradients(rounds, local_searches, scenario_gains, settings, tell)
+            _search_with_gradients(rounds, local_searches, scenario_gains, settings, announce)
         else:
-            _search_without_gradients(rounds, local_searches, scenario_gains, tell)
+            _search_without_gradients(rounds, local_searches, scenario_gains, announce)
         if settings.judged:
-            rounds.judge(local_searches.gains, tell)
+            rounds.judge(local_searches.gains, announce)
             if with_gradients and local_searches.best.violation > 0.0 and not local_searches.best.failed:
-                tell("finding the conflicting requirements")
-                conflict = local_searches.conflict(rounds.problem)
+                announce("finding the conflicting requirements")
+                conflict = local_searches.find_conflicts(rounds.problem)
     except KeyboardInterrupt:
         if not local_searches.started:
             raise
         interrupted = True
-    tell("end of the search")
+    announce("end of the search")
     best = local_searches.best
     return Search(
         gains=local_searches.gains,
         normalised=best.normalised,
         value=best.value,
         worst=np.where(best.failed, np.inf, best.worst),
-        ended=best.worst,
+        worst_completed=best.worst,
         ends=local_searches.ends,
         history=local_searches.history,
         problem=local_searches.problem,
@@ -131,7 +131,7 @@ def search(
         margins=margins,
         violation=best.violation,
         conflict=conflict,
-        globally=local_searches.globally,
+        searched_globally=local_searches.searched_globally,
         hardest=rounds.hardest,
         counts=[] if interrupted else rounds.counts,
         interrupted=interrupted,
@@ -139,35 +139,38 @@ def search(
 
 
 def _search_with_gradients(
-    rounds: Rounds, local_searches: LocalSearches, scenario_gains: np.ndarray, settings: Settings, tell: Announce
+    rounds: Rounds, local_searches: LocalSearches, scenario_gains: np.ndarray, settings: Settings, announce: Announce
 ) -> None:
     starts, seed = settings.starts, settings.seed
     local_searches.begin(rounds.problem, scenario_gains, settings.designs)
     rounds.begin(local_searches.gains)
     best = local_searches.explore(rounds.problem, starts, seed) if starts > 1 else {0: local_searches.normalised}
     local_searches.search_locally(rounds.problem, best)
-    _repeat_with_harder_trials(rounds, local_searches, local_searches.again, tell)
+    _repeat_with_harder_trials(rounds, local_searches, local_searches.continue_best, announce)
     if starts > 1 and local_searches.best.violation > 0.0:
-        tell(GLOBALLY)
+        announce(GLOBAL_SEARCH)
         local_searches.search_globally(rounds.problem, starts, seed + 1)
-        _repeat_with_harder_trials(rounds, local_searches, local_searches.again, tell)
+        _repeat_with_harder_trials(rounds, local_searches, local_searches.continue_best, announce)
 
 
 def _search_without_gradients(
-    rounds: Rounds, local_searches: LocalSearches, scenario_gains: np.ndarray, tell: Announce
+    rounds: Rounds, local_searches: LocalSearches, scenario_gains: np.ndarray, announce: Announce
 ) -> None:
-    local_searches.sweep(rounds.problem, scenario_gains)
+    local_searches.measure_sobol_points(rounds.problem, scenario_gains)
     rounds.begin(local_searches.gains)
     local_searches.evolve(rounds.problem, local_searches.normalised)
     _repeat_with_harder_trials(
-        rounds, local_searches, lambda problem: local_searches.evolve(problem, local_searches.normalised, NEARBY), tell
+        rounds,
+        local_searches,
+        lambda problem: local_searches.evolve(problem, local_searches.normalised, NEAR_BEST),
+        announce,
     )
 
 
 def _repeat_with_harder_trials(
-    rounds: Rounds, local_searches: LocalSearches, again: Callable[[Problem], None], tell: Announce
+    rounds: Rounds, local_searches: LocalSearches, continue_search: Callable[[Problem], None], announce: Announce
 ) -> None:
     """Repeat the search as long as harder trials join, unless the limits are out of reach."""
-    while np.all(local_searches.best.worst <= HOPELESS) and rounds.harder(local_searches.gains, tell):
-        tell(f"harder trials, round {rounds.count}")
-        again(rounds.problem)
+    while np.all(local_searches.best.worst <= HOPELESS) and rounds.add_harder_trials(local_searches.gains, announce):
+        announce(f"harder trials, round {rounds.count}")
+        continue_search(rounds.problem)

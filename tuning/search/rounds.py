@@ -12,14 +12,14 @@ from ptsmc_jax.simulation.requirements import Requirement
 from tuning.search import confirm, margin_rows
 from tuning.search import worst as worst_case
 from tuning.search.evaluate import Evaluator
-from tuning.search.objective import Problem, coordinates_of, kept_by_every_trial, replaced, with_trials
+from tuning.search.objective import Problem, coordinates_of, kept_by_every_trial, replace_entries, with_trials
 from tuning.search.worst import Hardest
 
 MARGIN = 0.03  # relative tightening of limits in the search: held-out trials can be harder than all screened trials
 SURE_MARGIN = 0.003  # `MARGIN` if no trial can be harder: with a search for the worst case, or without dispersions
 HARDEST = 8  # number of worst screened trials that join the constraints
 SPARE_SLOTS = 8  # slots for trials of later rounds: another number of trials would need another compilation
-BAND = confirm.FARTHER + confirm.NEARER  # number of trials in a band, see `confirm`
+BAND_SIZE = confirm.BAND_MAY_BREAK + confirm.BAND_MUST_KEEP  # number of trials in a band, see `confirm`
 ROUNDS = 6  # largest number of searches that are repeated with harder trials
 
 
@@ -29,7 +29,7 @@ class Joining:
 
     trials: np.ndarray  # (trials,) numbers that select the noise and the dispersions
     counted: np.ndarray  # (requirements,) bool: the limits that these trials must keep
-    coordinates: dict[str, list[float]] | None = None  # dispersions of a single trial, if moved by `worst.hardest`
+    coordinates: dict[str, list[float]] | None = None  # dispersions of a single trial, if moved by `worst.find_hardest`
 
 
 class Rounds:
@@ -55,130 +55,135 @@ class Rounds:
             robust: search for the worst case after each search, instead of screening.
         """
         self._evaluate, self._robust = evaluate, robust
-        every = [r for r in requirements if r.quantile is None]
-        self._every = every if problem.dispersion.varies else []  # requirements on every trial
+        on_every_trial = [r for r in requirements if r.quantile is None]
+        self._on_every_trial = on_every_trial if problem.dispersion.varies else []  # requirements on every trial
         several, quantile_sample = problem.trials.size > 1, np.asarray(problem.quantile_sample)
         # requirements on a fraction of the trials by their rows in the problem, and the rows with a band
         self._quantiles = {k: r for k, r in enumerate(requirements) if r.quantile is not None and several}
         self._bands = [k for k in self._quantiles if not quantile_sample[k].any()]
-        self.margin = SURE_MARGIN if (robust and self._every) or not several else MARGIN
-        limits = bool(self._every) + len(
+        self.margin = SURE_MARGIN if (robust and self._on_every_trial) or not several else MARGIN
+        limits = bool(self._on_every_trial) + len(
             self._quantiles
         )  # number of limits that can add their hardest trials in a round
         before = problem.trials.size
         if limits:
-            problem = _with_room(problem, limits * HARDEST + SPARE_SLOTS)
+            problem = _add_slots(problem, limits * HARDEST + SPARE_SLOTS)
         # slots of trials that join; the last ones hold trials that joined in an earlier search of the problem
-        self._places = np.r_[before : problem.trials.size, problem.averaged : before]
-        self.problem = _with_room(problem, len(self._bands) * BAND)
+        self._slots = np.r_[before : problem.trials.size, problem.averaged : before]
+        self.problem = _add_slots(problem, len(self._bands) * BAND_SIZE)
         self.count = 0  # number of rounds that have added harder trials or loops
         self.hardest: Hardest | None = None  # worst case of the last gains
         self.counts: list[confirm.Count] = []
-        self._joined, self._counted = 0, 0  # number of trials that have joined; number of calls of `confirm.count`
-        self._known: worst_case.Screened | None = None
+        self._joined = 0  # number of trials that have joined
+        self._confirmations = 0  # number of calls of `confirm.count_violations`
+        self._screening: worst_case.Screened | None = None
 
     def begin(self, gains: np.ndarray) -> None:
         """Add the hardest trials and loops for approximate gains, (gains,), to the constraints."""
-        self.problem, _ = _harder_margins(self.problem, gains)
+        self.problem, _ = _select_worst_loops(self.problem, gains)
         if self._bands:
-            counts = dict(zip(self._quantiles, self._count(gains), strict=True))
+            counts = dict(zip(self._quantiles, self._count_violations(gains), strict=True))
             self.problem = _with_bands(self.problem, {k: counts[k].band for k in self._bands})
-        if self._every:
-            hardest = _hardest(self.problem, *self._screened(gains))
+        if self._on_every_trial:
+            hardest = _select_hardest(self.problem, *self._screen(gains))
             self._join(Joining(hardest, kept_by_every_trial(self.problem)))
 
-    def harder(self, gains: np.ndarray, tell: Callable[[str], None]) -> bool:
+    def add_harder_trials(self, gains: np.ndarray, announce: Callable[[str], None]) -> bool:
         """Add trials and loops that violate a requirement, if a round is left. The search then continues.
 
         Args:
             gains: (gains,) the gains of the last search.
-            tell: is called with the name of each step.
+            announce: is called with the name of each step.
 
         Returns:
             Whether anything was added.
         """
-        if not (self._every or self._quantiles or self.problem.margins is not None):
+        if not (self._on_every_trial or self._quantiles or self.problem.margins is not None):
             return False
         joining: list[Joining] = []
-        nearer_loops, loops_break_limits = _harder_margins(self.problem, gains)
+        with_worst_loops, loops_break_limits = _select_worst_loops(self.problem, gains)
         if self._quantiles:  # each confirmation uses new trials, which were not screened
-            tell("confirming on other trials")
-            joining += self._confirmed(gains)
-        if self._every and self._robust:
-            tell("looking for the worst case")
-            self.hardest = worst_case.hardest(self.problem, self._every, gains, self._screened(gains))
+            announce("confirming on other trials")
+            joining += self._confirm_quantiles(gains)
+        if self._on_every_trial and self._robust:
+            announce("looking for the worst case")
+            self.hardest = worst_case.find_hardest(self.problem, self._on_every_trial, gains, self._screen(gains))
             if self.hardest.breaks_limit and not self.hardest.unbounded:
                 trial, counted = np.asarray([self.hardest.trial]), kept_by_every_trial(self.problem)
                 joining.append(Joining(trial, counted, self.hardest.coordinates))
-        elif self._every:
-            self._known = self._screened(gains)
-            if np.any(self._known[1] > 1.0):
-                joining.append(Joining(_hardest(self.problem, *self._known), kept_by_every_trial(self.problem)))
+        elif self._on_every_trial:
+            self._screening = self._screen(gains)
+            if np.any(self._screening[1] > 1.0):
+                joining.append(
+                    Joining(_select_hardest(self.problem, *self._screening), kept_by_every_trial(self.problem))
+                )
         if not (joining or loops_break_limits) or self.count == ROUNDS:
             return False
-        self.problem = nearer_loops if loops_break_limits else self.problem
-        for more in joining:
-            self._join(more)
+        self.problem = with_worst_loops if loops_break_limits else self.problem
+        for trials in joining:
+            self._join(trials)
         self.hardest = None  # the next search replaces the gains of this worst case
         self.count += 1
         return True
 
-    def judge(self, gains: np.ndarray, tell: Callable[[str], None]) -> None:
+    def judge(self, gains: np.ndarray, announce: Callable[[str], None]) -> None:
         """Find the worst case of the final gains, unless it is already known.
 
         Args:
             gains: (gains,) the final gains.
-            tell: is called with the name of the step.
+            announce: is called with the name of the step.
         """
-        if self._every and self.hardest is None:
-            tell("looking for the worst case")
-            self.hardest = worst_case.hardest(self.problem, self._every, gains, self._known)
+        if self._on_every_trial and self.hardest is None:
+            announce("looking for the worst case")
+            self.hardest = worst_case.find_hardest(self.problem, self._on_every_trial, gains, self._screening)
 
-    def _screened(self, gains: np.ndarray) -> worst_case.Screened:
+    def _screen(self, gains: np.ndarray) -> worst_case.Screened:
         self._evaluate.rollouts += worst_case.SCREENED
-        return worst_case.screen(self.problem, self._every, gains)
+        return worst_case.screen(self.problem, self._on_every_trial, gains)
 
-    def _count(self, gains: np.ndarray) -> list[confirm.Count]:
+    def _count_violations(self, gains: np.ndarray) -> list[confirm.Count]:
         """Count the trials beyond each limit on a fraction of the trials. Each call simulates other trials."""
         first = self.problem.averaged + worst_case.SCREENED
-        counts = confirm.count(self.problem, list(self._quantiles.values()), gains, first, self._counted)
-        self._counted += 1
+        counts = confirm.count_violations(
+            self.problem, list(self._quantiles.values()), gains, first, self._confirmations
+        )
+        self._confirmations += 1
         self._evaluate.rollouts += counts[0].trials
         return counts
 
-    def _confirmed(self, gains: np.ndarray) -> list[Joining]:
+    def _confirm_quantiles(self, gains: np.ndarray) -> list[Joining]:
         """Return the worst violators of each quantile requirement whose confirmation failed."""
-        self.counts = self._count(gains)
+        self.counts = self._count_violations(gains)
         rows = np.arange(len(self.problem.metrics))
         return [
-            Joining(one.harder[:HARDEST], rows == k)
+            Joining(one.surplus_violators[:HARDEST], rows == k)
             for k, one in zip(self._quantiles, self.counts, strict=True)
             if not one.confirmed
         ]
 
-    def _join(self, more: Joining) -> None:
-        at = self._places[(self._joined + np.arange(more.trials.size)) % self._places.size]
-        self.problem = _add(self.problem, at, more)
-        self._joined += more.trials.size
+    def _join(self, joining: Joining) -> None:
+        slots = self._slots[(self._joined + np.arange(joining.trials.size)) % self._slots.size]
+        self.problem = _fill_slots(self.problem, slots, joining)
+        self._joined += joining.trials.size
 
 
-def _with_room(problem: Problem, places: int) -> Problem:
+def _add_slots(problem: Problem, slots: int) -> Problem:
     """Return the problem with additional slots. They repeat the first trial until other trials join."""
-    return with_trials(problem, np.repeat(np.asarray(problem.trials)[:1], places))
+    return with_trials(problem, np.repeat(np.asarray(problem.trials)[:1], slots))
 
 
-def _harder_margins(problem: Problem, gains: np.ndarray) -> tuple[Problem, bool]:
+def _select_worst_loops(problem: Problem, gains: np.ndarray) -> tuple[Problem, bool]:
     """Return the problem with the loops that have the worst margins, and whether one of them breaks a limit."""
     if problem.margins is None:
         return problem, False
-    asked, near = margin_rows.hardest(problem.margins, gains)
-    return replace(problem, margins=asked), near > 1.0
+    worst, largest_ratio = margin_rows.select_hardest_trials(problem.margins, gains)
+    return replace(problem, margins=worst), largest_ratio > 1.0
 
 
-def _add(problem: Problem, at: np.ndarray, more: Joining) -> Problem:
+def _fill_slots(problem: Problem, slots: np.ndarray, joining: Joining) -> Problem:
     """Return the problem with more trials in these slots."""
-    placed = _placed(problem, at, more.trials, more.coordinates)
-    return replace(placed, counted=replaced(placed.counted, np.s_[:, at], more.counted[:, None]))
+    replaced = _replace_trials(problem, slots, joining.trials, joining.coordinates)
+    return replace(replaced, counted=replace_entries(replaced.counted, np.s_[:, slots], joining.counted[:, None]))
 
 
 def _with_bands(problem: Problem, bands: Mapping[int, np.ndarray]) -> Problem:
@@ -187,18 +192,18 @@ def _with_bands(problem: Problem, bands: Mapping[int, np.ndarray]) -> Problem:
     The bands are in the last slots.
     """
     for turn, (row, band) in enumerate(bands.items(), start=1):
-        at = problem.trials.size - turn * BAND + np.arange(band.size)
-        problem = _placed(problem, at, band)
+        slots = problem.trials.size - turn * BAND_SIZE + np.arange(band.size)
+        problem = _replace_trials(problem, slots, band)
         problem = replace(
             problem,
-            quantile_sample=replaced(problem.quantile_sample, np.s_[row, at], True),
-            counted=replaced(problem.counted, np.s_[row, : problem.averaged], False),
+            quantile_sample=replace_entries(problem.quantile_sample, np.s_[row, slots], True),
+            counted=replace_entries(problem.counted, np.s_[row, : problem.averaged], False),
         )
     return problem
 
 
-def _placed(
-    problem: Problem, at: np.ndarray, trials: np.ndarray, coordinates: Mapping[str, list[float]] | None = None
+def _replace_trials(
+    problem: Problem, slots: np.ndarray, trials: np.ndarray, coordinates: Mapping[str, list[float]] | None = None
 ) -> Problem:
     """Return the problem with other trials in these slots.
 
@@ -210,12 +215,12 @@ def _placed(
         added = {name: np.asarray(v)[None] for name, v in coordinates.items()}
     return replace(
         problem,
-        trials=replaced(problem.trials, at, trials),
-        coordinates={name: replaced(v, at, added[name]) for name, v in problem.coordinates.items()},
+        trials=replace_entries(problem.trials, slots, trials),
+        coordinates={name: replace_entries(v, slots, added[name]) for name, v in problem.coordinates.items()},
     )
 
 
-def _hardest(problem: Problem, trials: np.ndarray, ratio: np.ndarray) -> np.ndarray:
+def _select_hardest(problem: Problem, trials: np.ndarray, ratio: np.ndarray) -> np.ndarray:
     """Return the screened trials with the largest violation ratios that are not in the problem yet."""
     known = set(np.asarray(problem.trials).tolist())
     return np.asarray([t for t in trials[np.argsort(-ratio)] if int(t) not in known][:HARDEST], dtype=np.uint32)

@@ -57,7 +57,7 @@ class Derivatives(NamedTuple):
     derivatives: np.ndarray  # (points, trials, directions, metrics) derivatives
 
 
-def movable(dispersion: Dispersion) -> tuple[str, ...]:
+def differentiable_dispersions(dispersion: Dispersion) -> tuple[str, ...]:
     """Return the names of the dispersions with derivatives: all except for the true inertia."""
     return tuple(name for name in dispersion.kinds if name != INERTIA)
 
@@ -66,8 +66,8 @@ def simulate(batch: Batch, gains: np.ndarray) -> Simulated:
     """Simulate the trials at every point of gains, (points, gains). Return arrays (points, trials)."""
     rows = _Rows(len(gains), len(batch.trials), ROWS)
 
-    def call(some: dict[str, Any], needed: np.int32) -> Simulated:
-        return _simulate(*batch.shared, some, needed, batch.names, batch.pointing, rows.devices)
+    def call(arguments: dict[str, Any], needed: np.int32) -> Simulated:
+        return _simulate(*batch.shared, arguments, needed, batch.names, batch.pointing, rows.devices)
 
     return rows.apply(call, {"gains": gains}, batch.by_trial)
 
@@ -92,7 +92,7 @@ def simulate_with_derivatives(
         directions: (points, directions, gains) derivative of the gains along each direction.
         metrics: names of the metrics.
         shifts: derivative of the random numbers along each direction, (trials, directions, numbers) for each name of
-            `movable`. None: zero.
+            `differentiable_dispersions`. None: zero.
 
     Returns:
         Metrics, statuses and derivatives.
@@ -100,8 +100,8 @@ def simulate_with_derivatives(
     rows, count = _Rows(len(gains), len(batch.trials), ROWS_WITH_DERIVATIVES), directions.shape[1]
     shifts = _no_shifts(batch, count) if shifts is None else shifts
 
-    def call(some: dict[str, Any], needed: np.int32) -> tuple[jax.Array, jax.Array]:
-        return _simulate_with_derivatives(*batch.shared, some, needed, batch.names, metrics, rows.devices)
+    def call(arguments: dict[str, Any], needed: np.int32) -> tuple[jax.Array, jax.Array]:
+        return _simulate_with_derivatives(*batch.shared, arguments, needed, batch.names, metrics, rows.devices)
 
     by_point = {"gains": gains, "directions": directions}
     values, derivatives = rows.apply(call, by_point, {**batch.by_trial, "shifts": dict(shifts)})
@@ -112,7 +112,7 @@ def _no_shifts(batch: Batch, directions: int) -> dict[str, np.ndarray]:
     return {
         name: np.zeros((len(v), directions, *np.shape(v)[1:]))
         for name, v in batch.coordinates.items()
-        if name in movable(batch.dispersion)
+        if name in differentiable_dispersions(batch.dispersion)
     }
 
 
@@ -120,28 +120,30 @@ def prepare(batch: Batch, metrics: tuple[str, ...]) -> None:
     """Compile the programs of `simulate`, and of `simulate_with_derivatives` along all gains, in the background."""
     count, trials = len(batch.names), len(batch.trials)
     rows, gains = _Rows(1, trials, ROWS), {"gains": np.zeros((1, count))}
-    some, needed = rows.some(0, gains, batch.by_trial)
-    _simulate.prepare(*batch.shared, some, np.int32(needed), batch.names, batch.pointing, rows.devices)
+    arguments, needed = rows.call_arguments(0, gains, batch.by_trial)
+    _simulate.prepare(*batch.shared, arguments, np.int32(needed), batch.names, batch.pointing, rows.devices)
     rows = _Rows(1, trials, ROWS_WITH_DERIVATIVES)
     by_point = {**gains, "directions": np.zeros((1, count, count))}
-    some, needed = rows.some(0, by_point, {**batch.by_trial, "shifts": _no_shifts(batch, count)})
-    _simulate_with_derivatives.prepare(*batch.shared, some, np.int32(needed), batch.names, metrics, rows.devices)
+    arguments, needed = rows.call_arguments(0, by_point, {**batch.by_trial, "shifts": _no_shifts(batch, count)})
+    _simulate_with_derivatives.prepare(*batch.shared, arguments, np.int32(needed), batch.names, metrics, rows.devices)
 
 
 class _Rows:
     """Splits the trials of all points into rows of `ROW` trials, and the rows into calls of a program.
 
-    A call has at most `most` rows for each device.
+    A call has at most `max_rows` rows for each device.
     """
 
-    def __init__(self, points: int, trials: int, most: int):
+    def __init__(self, points: int, trials: int, max_rows: int):
         self.devices = len(configure.devices())
-        self._points, self._count, self._most = points, trials, most
+        self._points, self._count, self._max_rows = points, trials, max_rows
         # indices of the trials in the rows of one point
         self._trials = np.resize(np.arange(trials), (max(1, -(-trials // ROW)), ROW))
         self._rows = points * len(self._trials)
 
-    def some(self, first: int, by_point: dict[str, Any], by_trial: dict[str, Any]) -> tuple[dict[str, Any], int]:
+    def call_arguments(
+        self, first: int, by_point: dict[str, Any], by_trial: dict[str, Any]
+    ) -> tuple[dict[str, Any], int]:
         """Return the arguments of one call, (devices, rows, ..), and the number of rows of a device.
 
         Args:
@@ -149,8 +151,8 @@ class _Rows:
             by_point: arguments with points on the first axis.
             by_trial: arguments with trials on the first axis.
         """
-        count = min(self._rows - first, self.devices * self._most)
-        places, needed = montecarlo.scattered(count, self.devices, self._most)
+        count = min(self._rows - first, self.devices * self._max_rows)
+        places, needed = montecarlo.scatter(count, self.devices, self._max_rows)
         point, row = np.divmod(first + places, len(self._trials))
         trial = self._trials[row]
         by_row = {name: np.asarray(v)[point] for name, v in by_point.items()}
@@ -159,16 +161,16 @@ class _Rows:
     def apply(self, program: Callable, by_point: dict[str, Any], by_trial: dict[str, Any]) -> Any:
         """Apply a program to all rows. Return arrays (points, trials, ..)."""
         calls = []
-        for first in range(0, self._rows, self.devices * self._most):
-            some, needed = self.some(first, by_point, by_trial)
-            results = program(some, np.int32(needed))
-            calls.append(jax.tree.map(lambda v, needed=needed: montecarlo.gathered(v, needed), results))
+        for first in range(0, self._rows, self.devices * self._max_rows):
+            arguments, needed = self.call_arguments(first, by_point, by_trial)
+            results = program(arguments, np.int32(needed))
+            calls.append(jax.tree.map(lambda v, needed=needed: montecarlo.gather(v, needed), results))
 
-        def joined(*calls: np.ndarray) -> np.ndarray:
+        def join_calls(*calls: np.ndarray) -> np.ndarray:
             rows = np.concatenate(calls)[: self._rows]
             return rows.reshape(self._points, -1, *rows.shape[2:])[:, : self._count]
 
-        return jax.tree.map(joined, *calls)
+        return jax.tree.map(join_calls, *calls)
 
 
 @programs.jit(static_argnames=("names", "pointing", "devices"), batch=True, title="the simulations of the search")
@@ -188,20 +190,20 @@ def _simulate(
     """
     skipped = {*POINTING} - {*pointing}
 
-    def one(gains: jax.Array, trial: jax.Array, coordinates: Coordinates) -> Simulated:
-        moved = with_gains(parts, dict(zip(names, gains, strict=True)))
-        simulated = montecarlo.one(moved, dispersion, seed, trial, coordinates)
+    def simulate_trial(gains: jax.Array, trial: jax.Array, coordinates: Coordinates) -> Simulated:
+        tuned_parts = with_gains(parts, dict(zip(names, gains, strict=True)))
+        simulated = montecarlo.one(tuned_parts, dispersion, seed, trial, coordinates)
         metrics = Metrics({name: value for name, value in simulated.metrics.items() if name not in skipped})
         return simulated._replace(metrics=metrics)
 
     def simulate_row(row: dict[str, Any]) -> Simulated:
-        return lanes.vmap(one, (None, 0, 0), kernel=montecarlo.by_kernel())(
+        return lanes.vmap(simulate_trial, (None, 0, 0), kernel=montecarlo.uses_kernel())(
             row["gains"], row["trial"], row["coordinates"]
         )
 
     first = jax.tree.map(lambda v: v[0, 0, 0], {name: rows[name] for name in ("trial", "coordinates")})
-    result = jax.eval_shape(one, rows["gains"][0, 0], first["trial"], first["coordinates"])
-    return montecarlo.row_by_row(simulate_row, result, ROW, rows, needed, devices)
+    result = jax.eval_shape(simulate_trial, rows["gains"][0, 0], first["trial"], first["coordinates"])
+    return montecarlo.evaluate_rows(simulate_row, result, ROW, rows, needed, devices)
 
 
 @programs.jit(static_argnames=("names", "metrics", "devices"), batch=True, title="the gradients of the simulations")
@@ -217,20 +219,20 @@ def _simulate_with_derivatives(
 ) -> tuple[jax.Array, jax.Array]:
     """Return metrics, (devices, rows, trials, metrics + 1), with the status as the last one, and their derivatives."""
 
-    def one(gains: jax.Array, trial: jax.Array, fixed: Coordinates, free: Coordinates) -> jax.Array:
-        moved = with_gains(parts, dict(zip(names, gains, strict=True)))
-        simulated = montecarlo.one(moved, dispersion, seed, trial, {**fixed, **free})
+    def simulate_trial(gains: jax.Array, trial: jax.Array, fixed: Coordinates, free: Coordinates) -> jax.Array:
+        tuned_parts = with_gains(parts, dict(zip(names, gains, strict=True)))
+        simulated = montecarlo.one(tuned_parts, dispersion, seed, trial, {**fixed, **free})
         return jnp.stack([*(getattr(simulated.metrics, name) for name in metrics), simulated.status.astype(float)])
 
-    def with_derivatives(row: dict[str, Any]) -> tuple[jax.Array, jax.Array]:
+    def simulate_row(row: dict[str, Any]) -> tuple[jax.Array, jax.Array]:
         shifts = jax.tree.map(lambda v: jnp.moveaxis(v, 1, 0), row["shifts"])
         fixed = {name: v for name, v in row["coordinates"].items() if name not in shifts}
         free = {name: row["coordinates"][name] for name in shifts}
-        values, derivatives = lanes.jvp(one, (None, 0, 0, 0), kernel=montecarlo.by_kernel())(
+        values, derivatives = lanes.jvp(simulate_trial, (None, 0, 0, 0), kernel=montecarlo.uses_kernel())(
             (row["gains"], row["trial"], fixed, free), (row["directions"], None, None, shifts)
         )
         return values, jnp.moveaxis(derivatives, 0, 1)
 
     values = len(metrics) + 1
     result = jax.eval_shape(lambda: (jnp.zeros(values), jnp.zeros((rows["directions"].shape[2], values))))
-    return montecarlo.row_by_row(with_derivatives, result, ROW, rows, needed, devices)
+    return montecarlo.evaluate_rows(simulate_row, result, ROW, rows, needed, devices)

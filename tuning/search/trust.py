@@ -39,8 +39,8 @@ def gradient_error(evaluate: Evaluator, problem: Problem, normalised: np.ndarray
     Returns:
         The relative error [-]. It is NaN if F has no gradient: no trial completes, or the objective is zero.
     """
-    behind = 3 * DIFFERENCE_STEP * np.isin(problem.names, TIMES)
-    count, inside = normalised.size, np.clip(normalised + behind, 2 * DIFFERENCE_STEP, 1.0 - 2 * DIFFERENCE_STEP)
+    shift = 3 * DIFFERENCE_STEP * np.isin(problem.names, TIMES)
+    count, inside = normalised.size, np.clip(normalised + shift, 2 * DIFFERENCE_STEP, 1.0 - 2 * DIFFERENCE_STEP)
     offsets = np.concatenate([k * DIFFERENCE_STEP * np.eye(count) for k in (-2, -1, 1, 2)])
     measured = evaluate.measure(problem, inside + offsets)
     if np.isnan(measured.objective).all():  # no trial has an objective, so F is a constant
@@ -64,12 +64,12 @@ class Profile:
     nearest: list[str] = field(default_factory=list)  # (points,) metric with the largest metric / limit
 
     @property
-    def seen(self) -> bool:
+    def has_value(self) -> bool:
         """Whether the objective has a value at some point."""
         return bool(np.isfinite(self.value).any())
 
     @property
-    def flat(self) -> bool:
+    def is_flat(self) -> bool:
         """Whether neither F nor the largest metric / limit depends on the gain."""
         steady = self.f.max() - self.f.min() <= np.log1p(FLAT)
         return bool(steady and self.violation_ratio.max() <= (1.0 + FLAT) * self.violation_ratio.min())
@@ -118,23 +118,23 @@ def sensitivities(
     Returns:
         Sensitivities [-] by metric and gain.
     """
-    less, more = (np.clip(gains + side * np.diag(STEP * gains), bounds.lower, bounds.upper) for side in (-1.0, 1.0))
-    trials = problem.batch_of(np.asarray(problem.trials)[: problem.averaged])
-    simulated = simulations.simulate(trials, np.concatenate([less, more]))
+    down, up = (np.clip(gains + side * np.diag(STEP * gains), bounds.lower, bounds.upper) for side in (-1.0, 1.0))
+    batch = problem.batch_of(np.asarray(problem.trials)[: problem.averaged])
+    simulated = simulations.simulate(batch, np.concatenate([down, up]))
     finished = np.isin(simulated.status, rollout.FINISHED)
     metrics = (getattr(simulated.metrics, name) for name in names)
     with np.errstate(divide="ignore", invalid="ignore"):
         metric_rms = [
-            [rms(one[ended]) if ended.any() else np.nan for one, ended in zip(metric, finished, strict=True)]
+            [rms(one[done]) if done.any() else np.nan for one, done in zip(metric, finished, strict=True)]
             for metric in metrics
         ]
         below, above = np.split(np.transpose(metric_rms), 2)
-        rows = np.log(above / below) / np.log(np.diag(more) / np.diag(less))[:, None]
-    some = np.flatnonzero(gains)
+        rows = np.log(above / below) / np.log(np.diag(up) / np.diag(down))[:, None]
+    nonzero = np.flatnonzero(gains)
     return {
-        metric: {problem.names[k]: float(row[k]) for k in some}
+        metric: {problem.names[k]: float(row[k]) for k in nonzero}
         for metric, row in zip(names, np.transpose(rows), strict=True)
-        if some.size and np.all(np.isfinite(row[some]))
+        if nonzero.size and np.all(np.isfinite(row[nonzero]))
     }
 
 

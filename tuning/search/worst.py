@@ -1,6 +1,7 @@
 """The worst case of gains: the hardest of many random trials, then gradient ascent within the dispersions.
 
-Read `hardest` first. The ascent moves the random numbers of a trial, called coordinates, through unbounded variables y.
+Read `find_hardest` first. The ascent moves the random numbers of a trial, called coordinates, through unbounded
+variables y.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,21 +19,21 @@ from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.requirements import Requirement, violation_ratio
 from tuning.search import simulations
-from tuning.search.objective import FAILED, Problem, judged, watched
+from tuning.search.objective import FAILED, Problem, mark_failures, needed_metrics
 from tuning.search.simulations import Batch
 
 SCREENED = 4096  # number of screened trials
 ASCENTS = 8  # number of hardest screened trials where an ascent starts
 STEPS, RATE, LAST_RATE = 30, 0.1, 0.01  # number of steps of the ascent; first and last learning rate
-HELD = 0.9999  # probability content of the searched region of a normal dispersion
+PROBABILITY = 0.9999  # probability content of the searched region of a normal dispersion
 MEAN_VALUE_STEPS = 3  # steps of the advanced mean value method for normal dispersions, after the ascent
-NEAR = 1e-3  # a worst case may exceed a limit by this fraction
+LIMIT_TOLERANCE = 1e-3  # a worst case may exceed a limit by this fraction
 
 _ADAM = optax.adam(optax.cosine_decay_schedule(RATE, STEPS, LAST_RATE / RATE), b2=0.9)
 
 
 @programs.jit
-def _ascended(y: jax.Array, gradient: jax.Array, state: optax.OptState) -> tuple[jax.Array, optax.OptState]:
+def _ascend(y: jax.Array, gradient: jax.Array, state: optax.OptState) -> tuple[jax.Array, optax.OptState]:
     """Return the variables after one step of Adam along the normalised gradient, and the new state of Adam.
 
     Args:
@@ -65,8 +66,8 @@ class Hardest:
 
     @property
     def breaks_limit(self) -> bool:
-        """Whether the trial breaks its limit by more than `NEAR`."""
-        return not self.ratio <= 1.0 + NEAR
+        """Whether the trial breaks its limit by more than `LIMIT_TOLERANCE`."""
+        return not self.ratio <= 1.0 + LIMIT_TOLERANCE
 
 
 Screened = tuple[np.ndarray, np.ndarray]  # (trials,) numbers; (trials,) largest metric / limit
@@ -92,14 +93,14 @@ def screen(problem: Problem, requirements: Sequence[Requirement], gains: np.ndar
     return trials, np.max(np.where(simulated.finished & ~np.isnan(ratios), ratios, np.inf), axis=0)
 
 
-def hardest(
+def find_hardest(
     problem: Problem, requirements: Sequence[Requirement], gains: np.ndarray, screened: Screened | None = None
 ) -> Hardest:
     """Find the worst trial for these gains by gradient ascent (Adam) from the hardest screened trials.
 
     The ascent maximises metric / limit within the support of the dispersions. It moves all dispersions except for the
     true inertia, which keeps its random value, as the noise does. A normal dispersion has no bounds. Its numbers are
-    kept in the ball that has the probability `HELD`.
+    kept in the ball that has the probability `PROBABILITY`.
 
     Args:
         problem: the tuning problem.
@@ -111,42 +112,42 @@ def hardest(
     chosen = trials[np.argsort(-ratio, kind="stable")][:ASCENTS]
     limits = {r.metric: r.limit for r in requirements}
     batch = problem.batch_of(chosen)
-    moved = simulations.movable(problem.dispersion)
+    moved = simulations.differentiable_dispersions(problem.dispersion)
     variables = [_variables(problem, name, batch.coordinates[name]) for name in moved]
     y = np.concatenate([np.zeros((chosen.size, 0)), *variables], axis=1)
     best, best_y = np.full(len(y), -np.inf), y.copy()
 
     def evaluate(y: np.ndarray) -> np.ndarray:
-        value, gradient = ratio_with_gradient(batch, gains, y, watched(problem), limits)
+        value, gradient = ratio_with_gradient(batch, gains, y, needed_metrics(problem), limits)
         better = value > best
         best[better], best_y[better] = value[better], y[better]
         return np.where(np.isfinite(gradient), gradient, 0.0)
 
     state = _ADAM.init(y)
     for _ in range(STEPS + 1 if moved else 0):
-        ascended, state = _ascended(y, evaluate(y), state)
+        ascended, state = _ascend(y, evaluate(y), state)
         y = np.asarray(ascended)
-    normal = _normal(problem, moved)
-    y = _within(best_y, normal)
-    for _ in range(MEAN_VALUE_STEPS + 1 if normal else 0):
-        y = _within(y, normal, evaluate(y))
+    balls = _normal_balls(problem, moved)
+    y = _move_into_balls(best_y, balls)
+    for _ in range(MEAN_VALUE_STEPS + 1 if balls else 0):
+        y = _move_into_balls(y, balls, evaluate(y))
     first = int(np.argmax(best))
-    reached_at = {name: v[first : first + 1] for name, v in _moved_to(batch, best_y)[0].items()}
-    batch_of_one = batch._replace(trials=chosen[first : first + 1], coordinates=reached_at)
+    reached = {name: v[first : first + 1] for name, v in _coordinates_at(batch, best_y)[0].items()}
+    batch_of_one = batch._replace(trials=chosen[first : first + 1], coordinates=reached)
     simulated = jax.tree.map(lambda v: v[0, 0], simulations.simulate(batch_of_one, gains[None]))
     ratios = {
         m: float(violation_ratio(getattr(simulated.metrics, m), limit, at_least=False)) for m, limit in limits.items()
     }
     # a metric is NaN if it has no value, such as the settling time of a run that never settles
     ratios = {m: np.inf if np.isnan(v) else v for m, v in ratios.items()}
-    worst = max(ratios, key=ratios.__getitem__)
+    worst_metric = max(ratios, key=ratios.__getitem__)
     return Hardest(
-        metric=worst,
-        ratio=ratios[worst],
+        metric=worst_metric,
+        ratio=ratios[worst_metric],
         screened=float(ratio.max()),
         status=rollout.STATUS[int(simulated.status)][0],
         trial=int(chosen[first]),
-        coordinates={name: v[0].tolist() for name, v in reached_at.items()},
+        coordinates={name: v[0].tolist() for name, v in reached.items()},
         start={name: float(v) for name, v in simulated.drawn.items()},
         moved=moved,
     )
@@ -161,26 +162,28 @@ def _variables(problem: Problem, name: str, c: np.ndarray) -> np.ndarray:
     return np.arccos(1.0 - 2.0 * c) / np.pi if uniform else c
 
 
-def _places(coordinates: Coordinates, names: tuple[str, ...]) -> dict[str, slice]:
+def _variable_slices(coordinates: Coordinates, names: tuple[str, ...]) -> dict[str, slice]:
     """Return the slice of the variables that belongs to each of these names."""
     counts = [coordinates[name].shape[1] for name in names]
     ends = np.cumsum(counts, dtype=int).tolist()
     return {name: slice(end - count, end) for name, count, end in zip(names, counts, ends, strict=True)}
 
 
-def _normal(problem: Problem, moved: tuple[str, ...]) -> list[tuple[slice, float]]:
+def _normal_balls(problem: Problem, moved: tuple[str, ...]) -> list[tuple[slice, float]]:
     """Return the slice of the variables of each normal dispersion, and the radius of its ball."""
-    places, kinds = _places(problem.coordinates, moved), problem.dispersion.kinds
-    return [(place, _farthest(place.stop - place.start))
+    places, kinds = _variable_slices(problem.coordinates, moved), problem.dispersion.kinds
+    return [(place, _ball_radius(place.stop - place.start))
             for name, place in places.items() if kinds[name].drawn != "uniform"]  # fmt: skip
 
 
-def _farthest(count: int) -> float:
-    """Return the radius of the ball that contains this number of normal numbers with probability `HELD`."""
-    return float(np.sqrt(2.0 * special.gammaincinv(count / 2.0, HELD)))  # quantile of the chi-squared distribution
+def _ball_radius(count: int) -> float:
+    """Return the radius of the ball that contains normal random numbers with probability `PROBABILITY`."""
+    return float(
+        np.sqrt(2.0 * special.gammaincinv(count / 2.0, PROBABILITY))
+    )  # quantile of the chi-squared distribution
 
 
-def _within(y: np.ndarray, normal: list[tuple[slice, float]], gradient: np.ndarray | None = None) -> np.ndarray:
+def _move_into_balls(y: np.ndarray, balls: list[tuple[slice, float]], gradient: np.ndarray | None = None) -> np.ndarray:
     """Return the variables with the normal ones moved just inside their balls, where gradients are not clipped.
 
     If a gradient is given, the normal variables move to the point of the sphere in its direction. This is a step of the
@@ -189,17 +192,17 @@ def _within(y: np.ndarray, normal: list[tuple[slice, float]], gradient: np.ndarr
 
     Args:
         y: (cases, variables) variables.
-        normal: slice and radius of each normal dispersion.
+        balls: slice and radius of each normal dispersion.
         gradient: (cases, variables) gradient, or None.
     """
     y = y.copy()
-    for place, farthest in normal:
-        part, edge = y[:, place], (1.0 - 1e-9) * farthest
-        size = np.linalg.norm(part, axis=1, keepdims=True)
-        part = part * np.minimum(1.0, edge / np.maximum(size, 1e-12))
+    for place, radius in balls:
+        part, edge = y[:, place], (1.0 - 1e-9) * radius
+        norm = np.linalg.norm(part, axis=1, keepdims=True)
+        part = part * np.minimum(1.0, edge / np.maximum(norm, 1e-12))
         if gradient is not None:
-            steep = np.linalg.norm(gradient[:, place], axis=1, keepdims=True)
-            part = np.where(steep > 0.0, edge * gradient[:, place] / np.where(steep > 0.0, steep, 1.0), part)
+            length = np.linalg.norm(gradient[:, place], axis=1, keepdims=True)
+            part = np.where(length > 0.0, edge * gradient[:, place] / np.where(length > 0.0, length, 1.0), part)
         y[:, place] = part
     return y
 
@@ -222,38 +225,40 @@ def ratio_with_gradient(
     Returns:
         The ratio, (cases,), and its gradient, (cases, variables). A failed case has the ratio `FAILED` and no gradient.
     """
-    coordinates, shifts = _moved_to(batch, y)
+    coordinates, shifts = _coordinates_at(batch, y)
     batch, count, width = batch._replace(coordinates=coordinates), y.shape[1], len(batch.names)
     columns, limit = [metrics.index(name) for name in limits], np.asarray([*limits.values()], dtype=float)
     value, gradients = np.zeros(len(y)), list[np.ndarray]()
     for k in range(0, count, width):
-        shift = {name: _filled(v[:, k : k + width], width) for name, v in shifts.items()}
+        shift = {name: _pad_directions(v[:, k : k + width], width) for name, v in shifts.items()}
         simulated = jax.tree.map(
             lambda v: v[0],
             simulations.simulate_with_derivatives(batch, gains[None], np.zeros((1, width, width)), metrics, shift),
         )
         ratios_or_nan = jnp.asarray(violation_ratio(simulated.metrics[:, columns], limit, at_least=False))
-        ratios = np.asarray(judged(ratios_or_nan, jnp.asarray(simulated.status[:, None])))
-        nearest, value = ratios.argmax(axis=1), ratios.max(axis=1)
-        gradient = np.take_along_axis(simulated.derivatives[:, :, columns], nearest[:, None, None], axis=2)[:, :, 0]
-        gradients.append(np.where(value[:, None] < FAILED, gradient / (limit + (limit == 0.0))[nearest][:, None], 0.0))
+        ratios = np.asarray(mark_failures(ratios_or_nan, jnp.asarray(simulated.status[:, None])))
+        closest, value = ratios.argmax(axis=1), ratios.max(axis=1)
+        gradient = np.take_along_axis(simulated.derivatives[:, :, columns], closest[:, None, None], axis=2)[:, :, 0]
+        gradients.append(np.where(value[:, None] < FAILED, gradient / (limit + (limit == 0.0))[closest][:, None], 0.0))
     return value, np.concatenate(gradients, axis=1)[:, :count]
 
 
-def _filled(v: np.ndarray, width: int) -> np.ndarray:
+def _pad_directions(v: np.ndarray, width: int) -> np.ndarray:
     """Append zeros for unused directions, (cases, directions, ..)."""
     return np.concatenate([v, np.zeros((v.shape[0], width - v.shape[1], *v.shape[2:]))], axis=1)
 
 
-def _moved_to(batch: Batch, y: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+def _coordinates_at(batch: Batch, y: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Return the coordinates of variables y, and for each moved name their derivatives, (cases, variables, numbers)."""
-    names = simulations.movable(batch.dispersion)
-    moved, shifts = jax.tree.map(np.asarray, _moved(batch.dispersion, dict(batch.coordinates), y, names))
+    names = simulations.differentiable_dispersions(batch.dispersion)
+    moved, shifts = jax.tree.map(np.asarray, _to_coordinates(batch.dispersion, dict(batch.coordinates), y, names))
     return {**batch.coordinates, **moved}, shifts
 
 
-@programs.jit(static_argnames="names", compiler_options=programs.QUICKLY)
-def _moved(dispersion: Dispersion, coordinates: Coordinates, y: jax.Array, names: tuple[str, ...]) -> tuple[dict, dict]:
+@programs.jit(static_argnames="names", compiler_options=programs.FAST_COMPILE)
+def _to_coordinates(
+    dispersion: Dispersion, coordinates: Coordinates, y: jax.Array, names: tuple[str, ...]
+) -> tuple[dict, dict]:
     """Return the coordinates of these names for variables y, (cases, variables), and their derivatives.
 
     Args:
@@ -263,15 +268,17 @@ def _moved(dispersion: Dispersion, coordinates: Coordinates, y: jax.Array, names
         names: names of the moved dispersions.
     """
 
-    def of(y: jax.Array) -> Coordinates:
+    def to_coordinates(y: jax.Array) -> Coordinates:
         moved = {}
-        for name, place in _places(coordinates, names).items():
+        for name, place in _variable_slices(coordinates, names).items():
             part = y[place]
             if dispersion.kinds[name].drawn == "uniform":
                 moved[name] = 0.5 - 0.5 * jnp.cos(jnp.pi * part)
             else:
-                moved[name] = part * jnp.minimum(1.0, _farthest(part.size) / jnp.maximum(jnp.linalg.norm(part), 1e-12))
+                moved[name] = part * jnp.minimum(
+                    1.0, _ball_radius(part.size) / jnp.maximum(jnp.linalg.norm(part), 1e-12)
+                )
         return moved
 
-    gradients = jax.vmap(jax.jacfwd(of))(y)
-    return jax.vmap(of)(y), {name: jnp.swapaxes(v, 1, 2) for name, v in gradients.items()}
+    gradients = jax.vmap(jax.jacfwd(to_coordinates))(y)
+    return jax.vmap(to_coordinates)(y), {name: jnp.swapaxes(v, 1, 2) for name, v in gradients.items()}

@@ -17,52 +17,53 @@ from ptsmc_jax.simulation.requirements import INTERPRETATIONS, Requirement, Verd
 from tuning.studies.campaign_folder import Folder
 
 ERRORS = ("terminal_error", "window_error", "hold_error")  # norms of error vectors
-DRAWN = 1000  # largest number of trials whose histories are plotted
-POINTS = 5000  # largest number of trials in a scatter plot
+FAN_TRIALS = 1000  # largest number of trials whose histories are plotted
+SCATTER_TRIALS = 5000  # largest number of trials in a scatter plot
 
 
 def build(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
     """Return the figures of a campaign by name; summary: the content of its `summary.json`."""
-    parts = folder.whole_parts()
+    parts = folder.intact_parts()
     required = scenario.requirements(folder.scenario)
     limits = {r.metric: r.limit for r in required}
     names = list(dict.fromkeys((*limits, "window_error", "peak_torque")))
-    timed = [r.timed for r in required if r.timed is not None]
-    frame = rows.read(parts, ["trial", "status", "initial_angle", *names, *timed]).head(folder.trials)
-    finished = running.finished(frame)
-    of_time = {v["metric"]: _of_time(Verdict.read(v)) for v in summary["verdicts"]}
+    time_metrics = [r.timed for r in required if r.timed is not None]
+    frame = rows.read(parts, ["trial", "status", "initial_angle", *names, *time_metrics]).head(folder.trials)
+    finished = running.has_finished(frame)
+    time_fractions = {v["metric"]: _describe_time_fraction(Verdict.read(v)) for v in summary["verdicts"]}
     units, spacecraft = folder.units, folder.scenario.plant.kind == "spacecraft"
 
     def column(name: str, values: np.ndarray) -> plots.Column:
         unit, limit = units.get(name, ""), limits.get(name)
         if spacecraft and name in ERRORS:  # as an angle
             unit, values, limit = "rad", pointing_angle(values), None if limit is None else float(pointing_angle(limit))
-        return plots.Column(unit, values, limit, of_time.get(name, "")).in_readable_unit()
+        return plots.Column(unit, values, limit, time_fractions.get(name, "")).in_readable_unit()
 
     figures: dict[str, Figure] = {}
     if finished.any():
         if folder.can_simulate:  # campaigns store no histories, so the figure simulates its trials again
-            figures |= _fan(folder, frame, finished)
+            figures |= _plot_fan(folder, frame, finished)
         figures["distributions"] = plots.distributions(
             {name: column(name, np.where(finished, frame[name].to_numpy(), np.nan)) for name in names}
         )
     outcome = _outcomes(frame, required)
     totals = {name: int((outcome == name).sum()) for name in plots.MARKS}
-    fine = np.isin(outcome, ("ok", plots.AT_TIMES))
-    bad, good = np.flatnonzero(~fine)[: POINTS // 2], np.flatnonzero(fine)
-    some = np.concatenate([good[: POINTS - bad.size], bad])  # trials with problems last, so that their marks are on top
-    angle, torque = (frame[name].to_numpy().astype(float)[some] for name in ("initial_angle", "peak_torque"))
+    is_good = np.isin(outcome, ("ok", plots.AT_TIMES))
+    bad_trials, good_trials = np.flatnonzero(~is_good)[: SCATTER_TRIALS // 2], np.flatnonzero(is_good)
+    # trials with problems last, so that their marks are on top
+    plotted = np.concatenate([good_trials[: SCATTER_TRIALS - bad_trials.size], bad_trials])
+    angle, torque = (frame[name].to_numpy().astype(float)[plotted] for name in ("initial_angle", "peak_torque"))
     if np.isfinite(torque).any():
-        starts, torques = column("initial_angle", angle), column("peak_torque", torque)
-        figures["torque_by_angle"] = plots.torque_by_angle(starts, torques, outcome[some], totals)
+        angles, torques = column("initial_angle", angle), column("peak_torque", torque)
+        figures["torque_by_angle"] = plots.torque_by_angle(angles, torques, outcome[plotted], totals)
     drivers = summary["drivers"].get("window_error", {})
-    strongest = sorted(drivers, key=lambda name: -drivers[name]["first_order"])[:4]
-    if strongest:
-        inputs = rows.read(parts, strongest)[some]
+    strongest_inputs = sorted(drivers, key=lambda name: -drivers[name]["first_order"])[:4]
+    if strongest_inputs:
+        inputs = rows.read(parts, strongest_inputs)[plotted]
         figures["inputs"] = plots.inputs(
-            {name: column(name, inputs[name].to_numpy()) for name in strongest},
-            {name: column(name, frame[name].to_numpy()[some].astype(float)) for name in names[:4]},
-            outcome[some],
+            {name: column(name, inputs[name].to_numpy()) for name in strongest_inputs},
+            {name: column(name, frame[name].to_numpy()[plotted].astype(float)) for name in names[:4]},
+            outcome[plotted],
             totals,
         )
     return figures
@@ -76,33 +77,35 @@ def _outcomes(frame: pl.DataFrame, required: Sequence[Requirement]) -> np.ndarra
     """
     outcome = frame["status"].to_numpy().astype(object)
     ok = outcome == "ok"
-    for one in required:
-        beyond = ok & ~(frame[one.metric].to_numpy() <= one.limit)
-        breaks = beyond if one.timed is None else np.zeros_like(ok)
-        if one.timed is not None and one.interpretation == "temporal":
-            breaks = ok & ~(frame[one.timed].to_numpy() >= one.quantile)
-        outcome[beyond & (outcome == "ok")] = plots.AT_TIMES
-        outcome[breaks] = plots.BEYOND
+    for requirement in required:
+        is_beyond = ok & ~(frame[requirement.metric].to_numpy() <= requirement.limit)
+        is_broken = is_beyond if requirement.timed is None else np.zeros_like(ok)
+        if requirement.timed is not None and requirement.interpretation == "temporal":
+            is_broken = ok & ~(frame[requirement.timed].to_numpy() >= requirement.quantile)
+        outcome[is_beyond & (outcome == "ok")] = plots.AT_TIMES
+        outcome[is_broken] = plots.BEYOND
     return outcome
 
 
-def _of_time(verdict: Verdict) -> str:
+def _describe_time_fraction(verdict: Verdict) -> str:
     """Return the required and the observed fraction of time in words, or "" if the requirement counts trials."""
     if verdict.fraction_of_time is None or verdict.quantile is None:
         return ""
-    asked = f"required: {100 * verdict.quantile:g} % of {INTERPRETATIONS[verdict.interpretation].split(':')[0]}"
-    least = "at least " if verdict.interpretation == "temporal" else ""
-    return f"{asked}; seen: {least}{percent(verdict.fraction_of_time)} %"
+    required = f"required: {100 * verdict.quantile:g} % of {INTERPRETATIONS[verdict.interpretation].split(':')[0]}"
+    qualifier = "at least " if verdict.interpretation == "temporal" else ""
+    return f"{required}; seen: {qualifier}{percent(verdict.fraction_of_time)} %"
 
 
-def _fan(folder: Folder, frame: pl.DataFrame, finished: np.ndarray) -> dict[str, Figure]:
+def _plot_fan(folder: Folder, frame: pl.DataFrame, finished: np.ndarray) -> dict[str, Figure]:
     """Simulate the first trials and the trial with the largest window error again, and plot their errors over time.
 
     The result is empty if none of the first trials reaches its end, or if all errors are zero: the axis is logarithmic.
     """
     trials, window = frame["trial"].to_numpy(), frame["window_error"].to_numpy()  # a shard has only some of the trials
-    shown = trials[:DRAWN]
-    hardest = int(np.argmax(np.where(finished & np.isfinite(window), window, -np.inf)))
-    t, error = running.history(folder.without_metrics, np.append(shown, trials[hardest]).astype(np.uint32))
-    simulated, worst, ended = folder.scenario, (int(trials[hardest]), error[-1]), error[:-1][finished[: shown.size]]
-    return {"fan": plots.fan(t, ended, worst, simulated.controller.t_f, simulated.plant.kind)} if ended.any() else {}
+    first_trials = trials[:FAN_TRIALS]
+    worst_row = int(np.argmax(np.where(finished & np.isfinite(window), window, -np.inf)))
+    simulated = np.append(first_trials, trials[worst_row]).astype(np.uint32)
+    t, error = running.error_history(folder.campaign_without_metrics, simulated)
+    worst, finished_errors = (int(trials[worst_row]), error[-1]), error[:-1][finished[: first_trials.size]]
+    t_f, plant = folder.scenario.controller.t_f, folder.scenario.plant.kind
+    return {"fan": plots.fan(t, finished_errors, worst, t_f, plant)} if finished_errors.any() else {}

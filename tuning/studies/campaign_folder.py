@@ -1,7 +1,7 @@
 """Campaign folders: create, open and identify a Monte Carlo campaign, and simulate its trials.
 
 A campaign is identified by its scenario, its seed and checksums of all custom code. `Folder` has these data. `begin`
-creates a folder, `opened` reads one, and `simulate` simulates the missing trials. Read `Folder` first.
+creates a folder, `open_folder` reads one, and `simulate` simulates the missing trials. Read `Folder` first.
 """
 
 import contextlib
@@ -31,17 +31,17 @@ from ptsmc_jax.scenario import Study, custom, parsing, systems
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
-from ptsmc_jax.simulation.computer import OURS, Software
+from ptsmc_jax.simulation.computer import PYTHON_SOFTWARE, Software
 from tuning.search import custom_parts
 
 C_FOLDER = "controller"  # subfolder with the C code of the controller, if C code controls the simulated spacecraft
 THEORY = "theory.json"  # lower bound and margins, see `campaign_theory`
 TABLE = "run_table.parquet"  # the run table; `--dry-run` writes a folder instead
 RUN_TABLE = "run_table_sha256"  # key of the checksum of the run table in `versions.json`
-CUSTOM = f"{systems.WHERE}, a function of a run's Result and its Parts that returns named numbers"
+CUSTOM = f"{systems.NAME_FORMS}, a function of a run's Result and its Parts that returns named numbers"
 
 
-class Made(msgspec.Struct, frozen=True):
+class CampaignVersions(msgspec.Struct, frozen=True):
     """Entries of `versions.json` that define the rows of a campaign."""
 
     command: Literal["montecarlo"]
@@ -65,7 +65,7 @@ class Folder:
     trials: int  # number of trials of the complete campaign
     custom_metrics: str | None = None  # FILE.py:NAME of the function that computes custom metrics
     bits: int = 64  # floating-point precision
-    made: Made | None = None  # content of the existing folder; None: the folder does not exist yet
+    stored_versions: CampaignVersions | None = None  # of the existing folder; None: the folder does not exist yet
     checksums: Mapping[str, str] = field(default_factory=dict)  # checksums of custom code in the existing folder
     trusted: bool = True  # custom systems and metrics may be executed
     table_name: str | None = None  # file name of the run table
@@ -74,14 +74,14 @@ class Folder:
     first_look: int | None = None  # trials before the first check of `--until-confident`; None: one part
 
     @cached_property
-    def programs(self) -> dict[str, str]:
+    def custom_code(self) -> dict[str, str]:
         """The locations of all custom code that the campaign executes, by scenario key or option."""
-        return custom_parts.named(self.scenario, self.custom_metrics, self.controller)
+        return custom_parts.list_custom_code(self.scenario, self.custom_metrics, self.controller)
 
     @cached_property
-    def files(self) -> dict[str, str]:
+    def code_and_data_files(self) -> dict[str, str]:
         """The locations of custom code and data files, by scenario key or option."""
-        return self.programs | custom.data_files(self.scenario)
+        return self.custom_code | custom.data_files_by_key(self.scenario)
 
     @cached_property
     def identity(self) -> dict[str, Any]:
@@ -90,14 +90,14 @@ class Folder:
         The checksums are those in the folder if it exists, else those of the present files.
         """
         checksums = {}
-        for key, where in self.files.items():
+        for key, where in self.code_and_data_files.items():
             name = custom.checksum_name(key)
-            checksums[name] = self.checksums.get(name) if self.made else custom_parts.checksum(key, where)
+            checksums[name] = self.checksums.get(name) if self.stored_versions else custom_parts.checksum(key, where)
         if self.table is not None:
-            checksums[RUN_TABLE] = self.checksums.get(RUN_TABLE) if self.made else self.run_table.checksum
+            checksums[RUN_TABLE] = self.checksums.get(RUN_TABLE) if self.stored_versions else self.run_table.checksum
         metrics = {} if self.custom_metrics is None else {"metrics": self.custom_metrics}
-        known = {name: checksum for name, checksum in checksums.items() if checksum is not None}
-        return {"command": "montecarlo", "seed": self.seed, "precision": self.bits, **metrics, **known}
+        present = {name: checksum for name, checksum in checksums.items() if checksum is not None}
+        return {"command": "montecarlo", "seed": self.seed, "precision": self.bits, **metrics, **present}
 
     @property
     def versions(self) -> dict[str, Any]:
@@ -114,9 +114,9 @@ class Folder:
         """The names of the custom metrics."""
         if self.custom_metrics is None:
             return []
-        if self.made is None:
+        if self.stored_versions is None:
             return self._with_custom_metrics.custom_metric_names()
-        return list(self.made.metrics_names or ())
+        return list(self.stored_versions.metrics_names or ())
 
     @property
     def units(self) -> dict[str, str]:
@@ -130,21 +130,21 @@ class Folder:
         return Rows(self.path / rows.FOLDER, self._key)
 
     @cached_property
-    def dry(self) -> Rows:
+    def dry_run_rows(self) -> Rows:
         """The dispersions of the trials, which `--dry-run` writes without simulating."""
         return Rows(self.path / "runs", self._key)
 
     @property
     def _key(self) -> bytes:
-        return rows.key_of(parsing.dump(self.scenario), self.identity)
+        return rows.campaign_key(parsing.dump(self.scenario), self.identity)
 
     @cached_property
     def ready(self) -> Study | None:
         """The scenario, ready to simulate without custom metrics; None if that would execute untrusted custom code."""
-        named = set(self.programs) - {custom_parts.METRICS, custom_parts.CONTROLLER}
-        if named and not self.trusted:
+        code_keys = set(self.custom_code) - {custom_parts.METRICS, custom_parts.CONTROLLER}
+        if code_keys and not self.trusted:
             return None
-        for key in (*named, *custom.data_files(self.scenario)):
+        for key in (*code_keys, *custom.data_files_by_key(self.scenario)):
             self._check_unchanged(key)
         return scenario.study(self.scenario)
 
@@ -165,14 +165,14 @@ class Folder:
     @property
     def parameter_differences(self) -> str:
         """A sentence about parameters that differ between the C code and the scenario; empty if none differ."""
-        if self.made is not None:
-            return self.made.controller_otherwise or ""
+        if self.stored_versions is not None:
+            return self.stored_versions.controller_otherwise or ""
         return "" if self.computer is None else self.computer.parameter_differences
 
     @property
     def software(self) -> Software:
         """The controller of the simulation: the C code, or the simulated law."""
-        return OURS if self.computer is None else self.computer.software
+        return PYTHON_SOFTWARE if self.computer is None else self.computer.software
 
     @property
     def can_simulate(self) -> bool:
@@ -188,22 +188,24 @@ class Folder:
         """The validated run table. Raises RefusedError if it is invalid or has changed since the campaign began."""
         assert self.table is not None
         assert self.ready is not None
-        where = f"the run table {self.table_name}"
-        drawn = self.ready.dispersion.custom_names()
-        table = run_tables.checked(self.table, self.ready.parts, where, self.custom_metric_names, drawn)
-        if self.made is not None and table.checksum != self.checksums.get(RUN_TABLE):
+        description = f"the run table {self.table_name}"
+        custom_inputs = self.ready.dispersion.custom_names()
+        table = run_tables.check_table(
+            self.table, self.ready.parts, description, self.custom_metric_names, custom_inputs
+        )
+        if self.stored_versions is not None and table.checksum != self.checksums.get(RUN_TABLE):
             raise RefusedError(f"{self.path / TABLE} has changed: it is not the run table of the campaign")
         return table
 
     @cached_property
-    def without_metrics(self) -> Campaign:
+    def campaign_without_metrics(self) -> Campaign:
         """The campaign without custom metrics. Raises RefusedError if it needs untrusted code."""
         if self.ready is None:
             raise self._untrusted
         campaign = Campaign(self.ready, self.seed)
         if self.table is not None:
             where = f"the run table {self.table_name}"
-            campaign = running.of_run_table(self.ready, self.seed, self.run_table, where=where)
+            campaign = running.from_run_table(self.ready, self.seed, self.run_table, where=where)
         return replace(campaign, software=self.software)
 
     @cached_property
@@ -212,10 +214,9 @@ class Folder:
 
         Raises ScenarioError if the custom metrics are invalid, and RefusedError if the campaign needs untrusted code.
         """
-        custom_metrics = (
-            self._with_custom_metrics.custom_metrics
-        )  # before `without_metrics`, so that errors of the metrics are raised first
-        return replace(self.without_metrics, custom_metrics=custom_metrics)
+        # before `campaign_without_metrics`, so that errors of the metrics are raised first
+        custom_metrics = self._with_custom_metrics.custom_metrics
+        return replace(self.campaign_without_metrics, custom_metrics=custom_metrics)
 
     @cached_property
     def _with_custom_metrics(self) -> Campaign:
@@ -227,7 +228,7 @@ class Folder:
         self._check_unchanged(custom_parts.METRICS)
         software = self.software
         try:
-            metrics: Any = systems.item(self.custom_metrics, CUSTOM)
+            metrics: Any = systems.load_object(self.custom_metrics, CUSTOM)
             if not isinstance(metrics, Callable):
                 raise ValueError(f"it is of type {type(metrics).__name__}, but must be {CUSTOM}")
             campaign = Campaign(self.ready, self.seed, metrics, software=software)
@@ -237,14 +238,14 @@ class Folder:
             raise ScenarioError(f"--metrics is {self.custom_metrics}: {error}") from None
 
     def _check_unchanged(self, key: str) -> None:
-        if self.made is not None:
-            custom_parts.check_unchanged({key: self.files[key]}, self.path, self.identity)
+        if self.stored_versions is not None:
+            custom_parts.check_unchanged({key: self.code_and_data_files[key]}, self.path, self.identity)
 
     def recipe(self) -> tuple[Callable, tuple[str, str]]:
-        """Return a function, and arguments with which another process calls it to rebuild the campaign and its rows."""
-        return made_again, (str(self.path.resolve()), self._key.hex())
+        """Return a function and its arguments. Another process calls it to rebuild the campaign and its rows."""
+        return rebuild_campaign, (str(self.path.resolve()), self._key.hex())
 
-    def whole_parts(self) -> list[Part]:
+    def intact_parts(self) -> list[Part]:
         """Return the parts of the rows. Raises RefusedError if a part is damaged, or if there are none."""
         parts, broken = self.rows.parts()
         if broken:
@@ -263,58 +264,60 @@ def begin(folder: Folder, force: bool) -> None:
     force: discard the results of an existing campaign.
     """
     tables, path = parsing.dump(folder.scenario), folder.path
-    made = store.read_versions(path)  # files that no campaign wrote belong to the user
-    kept = sources.listed(path / C_FOLDER) if custom.checksum_name(custom_parts.CONTROLLER) in made else []
-    if folder.controller is not None and kept != sources.listed(path / C_FOLDER):
+    versions = store.read_versions(path)  # files that no campaign wrote belong to the user
+    has_c_code = custom.checksum_name(custom_parts.CONTROLLER) in versions
+    earlier_sources = sources.list_files(path / C_FOLDER) if has_c_code else []
+    if folder.controller is not None and earlier_sources != sources.list_files(path / C_FOLDER):
         raise RefusedError(f"--out is {path}, whose {C_FOLDER} contains C code of the user; allowed is another folder")
     if force and path.is_dir():
-        for rows_of in (folder.rows, folder.dry):
-            rows_of.tidy(())
-        for name in (THEORY, *([TABLE] if RUN_TABLE in made else [])):
+        for stored_rows in (folder.rows, folder.dry_run_rows):
+            stored_rows.tidy(())
+        for name in (THEORY, *([TABLE] if RUN_TABLE in versions else [])):
             (path / name).unlink(missing_ok=True)
-    elif _begun(folder, tables):
+    elif _contains_campaign(folder, tables):
         return
 
-    def fill(making: Path) -> None:
-        store.write_toml(making / "scenario.toml", tables)
-        store.write_json(making / "versions.json", folder.versions)
+    def write_files(staging: Path) -> None:
+        store.write_toml(staging / "scenario.toml", tables)
+        store.write_json(staging / "versions.json", folder.versions)
         if folder.table is not None:
             parts = folder.campaign.ready.parts
-            (making / TABLE).write_bytes(rows.encoded(folder.run_table.frame(parts)))
+            (staging / TABLE).write_bytes(rows.encode_parquet(folder.run_table.frame(parts)))
         if folder.controller is not None:
-            sources.copy(folder.controller, making / C_FOLDER)
-        for file in kept:  # only now, because these files may be the source of the copy
+            sources.copy(folder.controller, staging / C_FOLDER)
+        for file in earlier_sources:  # only now, because these files may be the source of the copy
             file.unlink(missing_ok=True)
         store.remove_summary(path)  # delete results of another campaign, or of fewer trials
 
-    store.write(path, fill)
+    store.write_folder(path, write_files)
 
 
-def _begun(folder: Folder, tables: Mapping[str, Any]) -> bool:
+def _contains_campaign(folder: Folder, tables: Mapping[str, Any]) -> bool:
     """Return whether the folder contains exactly this campaign.
 
     Raises RefusedError if the folder can neither be continued nor extended to this campaign.
     """
     path = folder.path
-    store.check(path, force=True)
+    store.check_folder(path, force=True)
     if not path.is_dir() or store.is_empty(path):
         return False
-    programs = [name for name in store.read_versions(path) if name == "metrics" or name.endswith("_sha256")]
-    store.refuse_others(path, tables, {**dict.fromkeys(programs), **folder.identity, **store.packages()})
-    before = opened(path)
-    if before.trials > folder.trials:
+    checksum_names = [name for name in store.read_versions(path) if name == "metrics" or name.endswith("_sha256")]
+    store.refuse_other_run(path, tables, {**dict.fromkeys(checksum_names), **folder.identity, **store.packages()})
+    earlier = open_folder(path)
+    if earlier.trials > folder.trials:
         raise RefusedError(
-            f"--trials is {folder.trials}, but must be at least {before.trials}, the number of trials in {path}"
+            f"--trials is {folder.trials}, but must be at least {earlier.trials}, the number of trials in {path}"
         )
-    made = msgspec.convert(folder.versions, Made)  # of a campaign that may not exist yet
-    same = before.trials == folder.trials and before.made == made and before.identity == folder.identity
-    if not same or before.controller is None:
-        return same
+    new_versions = msgspec.convert(folder.versions, CampaignVersions)  # of a campaign that may not exist yet
+    same_rows = earlier.stored_versions == new_versions and earlier.identity == folder.identity
+    is_same = earlier.trials == folder.trials and same_rows
+    if not is_same or earlier.controller is None:
+        return is_same
     key = custom_parts.CONTROLLER  # the folder's copy may be missing or changed
-    return custom_parts.checksum(key, before.programs[key]) == before.checksums.get(custom.checksum_name(key))
+    return custom_parts.checksum(key, earlier.custom_code[key]) == earlier.checksums.get(custom.checksum_name(key))
 
 
-def opened(path: Path) -> Folder:
+def open_folder(path: Path) -> Folder:
     """Read the campaign of a folder without executing its custom code. Raises RefusedError if there is no campaign."""
     try:
         versions = store.read_versions(path)
@@ -322,10 +325,10 @@ def opened(path: Path) -> Folder:
             raise RefusedError(
                 f"{path} has results of `ptsmc {versions['command']}`, but must have results of `ptsmc montecarlo`"
             )
-        made = msgspec.convert(versions, Made, strict=True)
-        if made.metrics is not None:
-            systems.named(made.metrics, CUSTOM)
-        simulated = scenario.read(path / "scenario.toml")
+        stored = msgspec.convert(versions, CampaignVersions, strict=True)
+        if stored.metrics is not None:
+            systems.split_name(stored.metrics, CUSTOM)
+        loaded = scenario.read(path / "scenario.toml")
     except ScenarioError as error:
         raise RefusedError(f"{path} contains a campaign, but its scenario cannot be read: {error}") from None
     except RefusedError:
@@ -335,28 +338,28 @@ def opened(path: Path) -> Folder:
     checksums = {name: value for name, value in versions.items() if name.endswith("_sha256") and isinstance(value, str)}
     return Folder(
         path=path,
-        scenario=simulated,
-        seed=made.seed,
-        trials=made.trials,
-        custom_metrics=made.metrics,
-        bits=made.precision,
-        made=made,
+        scenario=loaded,
+        seed=stored.seed,
+        trials=stored.trials,
+        custom_metrics=stored.metrics,
+        bits=stored.precision,
+        stored_versions=stored,
         checksums=checksums,
         trusted=False,
-        table_name=made.run_table,
-        table=None if made.run_table is None else run_tables.read(path / TABLE),
+        table_name=stored.run_table,
+        table=None if stored.run_table is None else run_tables.read(path / TABLE),
         controller=path / C_FOLDER if custom.checksum_name(custom_parts.CONTROLLER) in checksums else None,
-        first_look=made.first_look,
+        first_look=stored.first_look,
     )
 
 
-def made_again(path: str, key: str) -> tuple[Campaign, Rows]:
+def rebuild_campaign(path: str, key: str) -> tuple[Campaign, Rows]:
     """Rebuild a campaign and its rows in another process that can read the folder, see `Folder.recipe`.
 
     The key includes the scenario and the checksums. Matching keys therefore mean that this process executes the code
     that the user trusted when the campaign began. Raises RefusedError if the folder contains another campaign.
     """
-    folder = opened(Path(path))
+    folder = open_folder(Path(path))
     if folder.rows.key.hex() != key:
         raise RefusedError(f"{path} contains another campaign on this machine than on the machine that started it")
     folder = replace(folder, trusted=True)
@@ -367,7 +370,7 @@ def simulate(
     folder: Folder,
     shard: tuple[int, int],
     report: Callable[[Tally], None],
-    elsewhere: Callable[[Folder, list[Block]], Iterator[tuple[Part, int]]] | None = None,
+    simulate_remotely: Callable[[Folder, list[Block]], Iterator[tuple[Part, int]]] | None = None,
     trials: int | None = None,
 ) -> None:
     """Simulate the missing trials. Damaged parts are reported, renamed and simulated again.
@@ -376,41 +379,42 @@ def simulate(
         folder: the campaign.
         shard: (i, n) simulates the i-th of n shards, i from 1 to n.
         report: called with the progress after every part.
-        elsewhere: simulates parts on other machines; None: this process simulates them.
+        simulate_remotely: simulates parts on other machines; None: this process simulates them.
         trials: simulate only the first trials up to this number; None: all of them.
     """
     trials = folder.trials if trials is None else trials
     parts, broken = folder.rows.parts()
     for path in broken:
-        aside = path.with_name(path.name + ".damaged")
+        renamed = path.with_name(path.name + ".damaged")
         with contextlib.suppress(FileNotFoundError):  # another shard may have renamed the part
-            os.replace(path, aside)
-        what = "is damaged and is simulated again" if rows.named(path) else "is no part of a campaign"
-        print(f"ptsmc: {path} {what}; it is kept as {aside.name}", file=sys.stderr)
-    alone = shard == (1, 1) and elsewhere is None
-    if alone:  # otherwise other processes may be writing into the folder
+            os.replace(path, renamed)
+        message = "is damaged and is simulated again" if rows.has_part_name(path) else "is no part of a campaign"
+        print(f"ptsmc: {path} {message}; it is kept as {renamed.name}", file=sys.stderr)
+    is_only_writer = shard == (1, 1) and simulate_remotely is None
+    if is_only_writer:  # otherwise other processes may be writing into the folder
         folder.rows.tidy(parts)
-    wanted = running.missing(parts, trials, shard)
-    landing = (
-        elsewhere(folder, wanted) if elsewhere else running.make_parts(folder.campaign.simulate, folder.rows, wanted)
-    )
-    running.report_progress(landing, running.tally(running.kept_parts(parts, wanted), trials), report)
-    if alone:
+    blocks = running.missing_parts(parts, trials, shard)
+    if simulate_remotely:
+        finished_parts = simulate_remotely(folder, blocks)
+    else:
+        finished_parts = running.make_parts(folder.campaign.simulate, folder.rows, blocks)
+    running.report_progress(finished_parts, running.count_progress(running.kept_parts(parts, blocks), trials), report)
+    if is_only_writer:
         folder.rows.tidy(folder.rows.parts()[0])
 
 
 def write_run_table(folder: Folder, report: Callable[[Tally], None]) -> None:
     """Write the dispersions of each trial without simulating it (`ptsmc montecarlo --dry-run`)."""
-    parts, _ = folder.dry.parts()
-    folder.dry.tidy(parts)
-    wanted = running.missing(parts, folder.trials)
-    landing = running.make_parts(folder.campaign.draw, folder.dry, wanted)
-    done = sum(part.count for part in running.kept_parts(parts, wanted))
-    running.report_progress(landing, Tally(done, folder.trials, 0), report)
+    parts, _ = folder.dry_run_rows.parts()
+    folder.dry_run_rows.tidy(parts)
+    blocks = running.missing_parts(parts, folder.trials)
+    finished_parts = running.make_parts(folder.campaign.draw, folder.dry_run_rows, blocks)
+    done = sum(part.count for part in running.kept_parts(parts, blocks))
+    running.report_progress(finished_parts, Tally(done, folder.trials, 0), report)
 
 
-def settle(folder: Folder, trials: int) -> Folder:
+def write_trial_count(folder: Folder, trials: int) -> Folder:
     """Return the campaign with this final number of trials, and write the number to `versions.json`."""
-    settled = replace(folder, trials=trials, first_look=None)
-    store.write_json(folder.path / "versions.json", settled.versions)
-    return settled
+    final = replace(folder, trials=trials, first_look=None)
+    store.write_json(folder.path / "versions.json", final.versions)
+    return final

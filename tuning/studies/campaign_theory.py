@@ -22,10 +22,10 @@ def write_missing(folder: Folder) -> None:
     """
     if _lacks_theory(folder):
         ready, table = folder.campaign.ready, folder.campaign.run_table
-        pooled = 0 if table is None else min(runs.BOUND_TRIALS, table.count)
-        first = [] if table is None else [table.row(k, folder.seed) for k in range(pooled)]
-        verdicts = margin_verdicts.of_trials(ready, folder.seed, _rows_with_margins(folder))
-        lower_bound = runs.rms_lower_bound(ready, folder.seed, first)
+        bound_trials = 0 if table is None else min(runs.BOUND_TRIALS, table.count)
+        first_rows = [] if table is None else [table.row(k, folder.seed) for k in range(bound_trials)]
+        verdicts = margin_verdicts.judge_trials(ready, folder.seed, _rows_with_margins(folder))
+        lower_bound = runs.rms_lower_bound(ready, folder.seed, first_rows)
         theory = {"lower_bound": lower_bound, "margins": [verdict.in_summary() for verdict in verdicts]}
         store.write_json(folder.path / THEORY, theory)
 
@@ -38,7 +38,7 @@ def prepare(folder: Folder) -> None:
 
 
 def _lacks_theory(folder: Folder) -> bool:
-    return "lower_bound" not in _theory(folder) or bool(unjudged(folder))
+    return "lower_bound" not in _read_theory(folder) or bool(margins_without_verdict(folder))
 
 
 def _rows_with_margins(folder: Folder) -> np.ndarray | Row | None:
@@ -47,23 +47,23 @@ def _rows_with_margins(folder: Folder) -> np.ndarray | Row | None:
     return None if table is None else table.rows(np.arange(min(margin_verdicts.TRIALS, table.count)), folder.seed)
 
 
-def lower_bound_of(folder: Folder) -> float | None:
+def read_lower_bound(folder: Folder) -> float | None:
     """Return the lower bound of the RMS window error that `write_missing` wrote; None: there is none."""
-    return _theory(folder).get("lower_bound")
+    return _read_theory(folder).get("lower_bound")
 
 
-def margins_of(folder: Folder) -> list[dict[str, Any]]:
+def read_margin_verdicts(folder: Folder) -> list[dict[str, Any]]:
     """Return the verdicts on margins that `write_missing` wrote, as in `summary.json`."""
-    return _theory(folder).get("margins", [])
+    return _read_theory(folder).get("margins", [])
 
 
-def unjudged(folder: Folder) -> list[str]:
+def margins_without_verdict(folder: Folder) -> list[str]:
     """Return the required margins without a verdict: the campaign was interrupted, or `theory.json` is damaged."""
-    judged = {verdict["metric"] for verdict in margins_of(folder)}
+    judged = {verdict["metric"] for verdict in read_margin_verdicts(folder)}
     return [name for name in catalogues.MARGINS if name in folder.scenario.requirements and name not in judged]
 
 
-def _theory(folder: Folder) -> dict[str, Any]:
+def _read_theory(folder: Folder) -> dict[str, Any]:
     try:
         return dict(json.loads((folder.path / THEORY).read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError):

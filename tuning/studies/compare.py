@@ -37,7 +37,7 @@ OURS, PUBLISHED = "prescribed_time", "published"  # the prescribed-time law with
 INERTIA_ERROR = 0.1  # relative difference between the true inertia and the design model
 MODEL_ERRORS = ("heavier", "lighter", "later")
 # keys of `tune` that are the same for every law
-KEPT = ("minimise", "statistic", "level", "torque_weight", "worst_case", "trials", "starts", "steps")
+SHARED_KEYS = ("minimise", "statistic", "level", "torque_weight", "worst_case", "trials", "starts", "steps")
 
 
 @dataclass(frozen=True)
@@ -50,13 +50,13 @@ class Contender:
     trials: Trials
     verdicts: list[Verdict]
     lower_bound: float | None  # lower bound of the RMS window error
-    margins: dict[str, dict[str, Any]] | None = None  # margins of the nominal loop, see `stability.worst`
-    changed: Mapping[str, Trials] = field(default_factory=dict)  # trials with unknown model errors, see `perturbed`
+    margins: dict[str, dict[str, Any]] | None = None  # margins of the nominal loop, see `stability.worst_margins`
+    changed: Mapping[str, Trials] = field(default_factory=dict)  # trials with each of the `MODEL_ERRORS`
 
     @property
     def met(self) -> bool:
         """Whether every requirement is met, every trial reaches its end, and every trial converges by t_f."""
-        return judging.met(self.verdicts, self.trials)
+        return judging.meets_requirements(self.verdicts, self.trials)
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def check(scenario: Scenario) -> None:
         raise ScenarioError(f'loop.mode is {mode}, but must be "sampled": the other laws need the sampled loop')
 
 
-def laws() -> list[str]:
+def law_kinds() -> list[str]:
     """Return the kinds of the compared laws, the prescribed-time law first."""
     return [OURS, *(kind for kind, law in LAWS["spacecraft"].items() if kind != "prescribed_time" and kind != "custom")]
 
@@ -103,43 +103,43 @@ class Rivals:
 
     def check(self) -> None:
         """Raise UsageError if a kind is unknown, or the location of a custom law is malformed or has no file."""
-        others = laws()[1:]
+        others = law_kinds()[1:]
         for kind in self.kinds or ():
             if kind not in others:
                 raise UsageError(f"--against is {kind}, but must be one of {', '.join(others)}")
-        for where in self.custom:
+        for location in self.custom:
             try:
-                place, _ = systems.named(where, systems.WHERE)
-                if place.endswith(".py") and not Path(place).is_file():
-                    raise ValueError(f"the file {place} does not exist")
+                file, _ = systems.split_name(location, systems.NAME_FORMS)
+                if file.endswith(".py") and not Path(file).is_file():
+                    raise ValueError(f"the file {file} does not exist")
             except ValueError as error:
-                raise UsageError(f"--law is {where}: {error}") from None
+                raise UsageError(f"--law is {location}: {error}") from None
 
     @property
-    def named(self) -> dict[str, dict[str, str]]:
+    def law_tables(self) -> dict[str, dict[str, str]]:
         """The keys of the table [controller] that select each law, by its label, the prescribed-time law first."""
-        kinds = laws() if self.kinds is None else [OURS, *self.kinds]
+        kinds = law_kinds() if self.kinds is None else [OURS, *self.kinds]
         tables = {kind: {"kind": kind} for kind in kinds}
         for code in self._codes:
-            tables[_free_name(code.rpartition(":")[2], tables)] = {"kind": "custom", "code": code}
+            tables[_unique_label(code.rpartition(":")[2], tables)] = {"kind": "custom", "code": code}
         return tables
 
     @property
     def _codes(self) -> list[str]:
         """The locations of the custom laws with symbolic links resolved, without duplicates."""
-        split = (where.rpartition(":") for where in self.custom)
-        codes = (f"{os.path.realpath(at)}:{name}" if at.endswith(".py") else f"{at}:{name}" for at, _, name in split)
+        parts = (location.rpartition(":") for location in self.custom)
+        codes = (f"{os.path.realpath(at)}:{name}" if at.endswith(".py") else f"{at}:{name}" for at, _, name in parts)
         return list(dict.fromkeys(codes))
 
     def identity(self) -> dict[str, Any]:
         """Return the entries of `versions.json` that identify these laws; empty for the default laws."""
         checksums = {code: systems.checksum(code) for code in self._codes}
-        return {"laws": list(self.named), "custom_laws": checksums} if self != Rivals() else {}
+        return {"laws": list(self.law_tables), "custom_laws": checksums} if self != Rivals() else {}
 
 
-def _free_name(name: str, taken: Iterable[str]) -> str:
-    """Return a unique label for a custom law: its class name, after "custom" if another law has this label."""
-    while name in (PUBLISHED, *taken):
+def _unique_label(name: str, labels: Iterable[str]) -> str:
+    """Return a unique label for a custom law: its class name, preceded by "custom" if another law has this label."""
+    while name in (PUBLISHED, *labels):
         name = f"custom {name}"
     return name
 
@@ -151,65 +151,65 @@ def contenders(scenario: Scenario, rivals: Rivals = Rivals()) -> dict[str, Scena
     scenario's own law is included if it is among the requested laws, or if it is a custom law.
     """
     table, tune = scenario.controller, scenario.search
-    same = {key: getattr(tune, key) for key in KEPT if getattr(tune, key) is not None}
-    posed = {}
-    for name, law in rivals.named.items():
-        if _is_law(table, law):
-            posed[name] = scenario
+    shared = {key: getattr(tune, key) for key in SHARED_KEYS if getattr(tune, key) is not None}
+    scenarios = {}
+    for name, law in rivals.law_tables.items():
+        if _has_law(table, law):
+            scenarios[name] = scenario
         elif name == OURS:
-            posed[name] = _posed(gains.published_scenario(scenario), tune, same)
+            scenarios[name] = _with_default_search(gains.published_scenario(scenario), tune, shared)
         else:
             fields = LAWS["spacecraft"][law["kind"]].__struct_fields__
-            both = "sign_width" in fields and hasattr(table, "sign_width")
-            width = {"sign_width": table.sign_width} if both else {}
+            both_have_width = "sign_width" in fields and hasattr(table, "sign_width")
+            width = {"sign_width": table.sign_width} if both_have_width else {}
             law = {**law, **common_keys(table), **width}
-            posed[name] = _posed(replace(scenario, tune=None, controller=law), tune, same)
-    if table.kind == "custom" and all(one is not scenario for one in posed.values()):
-        posed[_free_name(type(table).__name__, posed)] = scenario
-    return posed
+            scenarios[name] = _with_default_search(replace(scenario, tune=None, controller=law), tune, shared)
+    if table.kind == "custom" and all(candidate is not scenario for candidate in scenarios.values()):
+        scenarios[_unique_label(type(table).__name__, scenarios)] = scenario
+    return scenarios
 
 
-def _is_law(table: Any, law: Mapping[str, str]) -> bool:
-    """Return whether the scenario's law is this law. Custom laws are compared by file, links resolved, and name."""
+def _has_law(table: Any, law: Mapping[str, str]) -> bool:
+    """Return whether the scenario's law is this law. Custom laws are compared by file and class name."""
     if table.kind != law["kind"] or table.kind != "custom":
         return table.kind == law["kind"]
 
-    def place(code: str) -> tuple[Any, str]:
+    def file_and_class(code: str) -> tuple[Any, str]:
         return systems.location(code), code.rpartition(":")[2]
 
-    return isinstance(table.code, str) and place(table.code) == place(law["code"])
+    return isinstance(table.code, str) and file_and_class(table.code) == file_and_class(law["code"])
 
 
-def that_can_be_simulated(scenario: Scenario, rivals: Rivals = Rivals()) -> dict[str, Scenario]:
+def validated_contenders(scenario: Scenario, rivals: Rivals = Rivals()) -> dict[str, Scenario]:
     """Return the contenders, see `contenders`.
 
     Raises ScenarioError if a law cannot control the scenario. The check comes before the search, which may take hours.
     """
-    each = contenders(scenario, rivals)
-    for law, posed in each.items():
+    candidates = contenders(scenario, rivals)
+    for law, candidate in candidates.items():
         try:
-            study(posed)
-            free_gains.need_some(posed)
+            study(candidate)
+            free_gains.require_free_gains(candidate)
         except ScenarioError as error:
             raise ScenarioError(f"the law {law} cannot be used in this scenario: {error}") from None
-    return each
+    return candidates
 
 
-def _posed(other: Scenario, tune: tables.Tune, same: dict[str, Any]) -> Scenario:
+def _with_default_search(other: Scenario, tune: tables.Tune, shared: dict[str, Any]) -> Scenario:
     """Return the scenario with the default free gains of its law, and with the same bounds of t_f if t_f is minimised.
 
     Args:
         other: the scenario with another law.
         tune: the table of the original scenario.
-        same: keys of `tune` that are the same for every law, with their values.
+        shared: keys of `tune` that are the same for every law, with their values.
     """
     if tune.minimise != T_F:
-        return replace(other, tune=same)
-    free = [*replace(other, tune={}).search.gains, "t_f"]
-    return replace(other, tune={**same, "free": free, "bounds": {"t_f": tune.bounds["t_f"]}})
+        return replace(other, tune=shared)
+    free_names = [*replace(other, tune={}).search.gains, "t_f"]
+    return replace(other, tune={**shared, "free": free_names, "bounds": {"t_f": tune.bounds["t_f"]}})
 
 
-def perturbed(simulated: Scenario) -> dict[str, Scenario]:
+def perturbed_scenarios(simulated: Scenario) -> dict[str, Scenario]:
     """Return the scenario with each model error that the law does not know, by the names in `MODEL_ERRORS`.
 
     The true inertia is 10 % larger or smaller than in the design model, or the delay is one control period longer. A
@@ -222,23 +222,25 @@ def perturbed(simulated: Scenario) -> dict[str, Scenario]:
         {"spacecraft__true_inertia": ((1.0 - INERTIA_ERROR) * inertia).tolist()},
         {"hardware__delay": simulated.devices.delay_periods + 1},
     ]
-    others = {}
+    variants = {}
     for name, change in zip(MODEL_ERRORS, changes, strict=True):
         with contextlib.suppress(ScenarioError):
-            others[name] = replace(simulated, **change)
-    return others
+            variants[name] = replace(simulated, **change)
+    return variants
 
 
-def _with_more(one: Contender, held_out_seed: int) -> Contender:
-    """Return the contender with its stability margins, and with the trials under the model errors of `perturbed`."""
-    changed = {name: judging.judge(other, held_out_seed) for name, other in perturbed(one.simulated).items()}
-    return dataclasses.replace(one, margins=stability.worst(study(one.simulated)), changed=changed)
+def _add_margins_and_model_errors(contender: Contender, held_out_seed: int) -> Contender:
+    """Return the contender with its stability margins, and with its trials under each of the `MODEL_ERRORS`."""
+    variants = perturbed_scenarios(contender.simulated)
+    changed = {name: judging.judge(variant, held_out_seed) for name, variant in variants.items()}
+    margins = stability.worst_margins(study(contender.simulated))
+    return dataclasses.replace(contender, margins=margins, changed=changed)
 
 
 def compare(
     scenario: Scenario,
     seed: int,
-    tell: Report,
+    report: Report,
     journal: Journal | None = None,
     rivals: Mapping[str, Scenario] | None = None,
 ) -> Comparison:
@@ -247,9 +249,9 @@ def compare(
     Args:
         scenario: the mission, requirements and dispersions for all laws.
         seed: seed of the searches. The seed of the held-out trials follows from it.
-        tell: called with the progress after every step.
+        report: called with the progress after every step.
         journal: evaluations of an interrupted comparison, which then resumes.
-        rivals: the scenario with each law, as `that_can_be_simulated` returns it; None: all built-in laws.
+        rivals: the scenario with each law, as `validated_contenders` returns it; None: all built-in laws.
 
     Returns:
         The results of each law. If the comparison is interrupted, the laws after the interruption are missing.
@@ -257,48 +259,48 @@ def compare(
     Raises:
         ScenarioError: a law cannot control the scenario.
     """
-    held_out_seed = judging.seed_of_judge(seed)
-    rivals = that_can_be_simulated(scenario) if rivals is None else rivals
-    others, refused = judging.beside(scenario)
-    found, interrupted = {}, False
-    if PUBLISHED in others:
-        tell("published gains: verifying on held-out trials", 0, 0, np.nan, 0.0)
-        judged = _published(judging.on_flight_clock(others[PUBLISHED]), held_out_seed)
-        found[PUBLISHED] = _with_more(judged, held_out_seed)
-    for number, (law, posed) in enumerate(rivals.items(), 1):
-        report = headed(tell, f"{law}, law {number} of {len(rivals)}")
+    held_out_seed = judging.derive_held_out_seed(seed)
+    rivals = validated_contenders(scenario) if rivals is None else rivals
+    references, published_error = judging.reference_scenarios(scenario)
+    results, interrupted = {}, False
+    if PUBLISHED in references:
+        report("published gains: verifying on held-out trials", 0, 0, np.nan, 0.0)
+        judged = _judge_published(judging.on_flight_clock(references[PUBLISHED]), held_out_seed)
+        results[PUBLISHED] = _add_margins_and_model_errors(judged, held_out_seed)
+    for number, (law, candidate) in enumerate(rivals.items(), 1):
+        law_report = headed(report, f"{law}, law {number} of {len(rivals)}")
         # more tries would judge the laws on different held-out trials
-        tuned = tuner.tune(posed, seed, report, journal, trusted=False, tries=1)
+        tuned = tuner.tune(candidate, seed, law_report, journal, with_checks=False, tries=1)
         held_out, lower_bound = tuned.held_out["tuned"], tuned.lower_bounds["tuned"]
-        found[law] = Contender(tuned.tuned, tuned.gains, tuned.at_bound, held_out, tuned.verdicts, lower_bound)
+        results[law] = Contender(tuned.tuned, tuned.gains, tuned.at_bound, held_out, tuned.verdicts, lower_bound)
         interrupted = tuned.search.interrupted
         if interrupted:
             break
-        report("simulating a wrong inertia and a longer delay", 0, 0, np.nan, 0.0)
-        found[law] = _with_more(found[law], held_out_seed)
-    return Comparison(found, held_out_seed, interrupted, refused)
+        law_report("simulating a wrong inertia and a longer delay", 0, 0, np.nan, 0.0)
+        results[law] = _add_margins_and_model_errors(results[law], held_out_seed)
+    return Comparison(results, held_out_seed, interrupted, published_error)
 
 
-def _published(simulated: Scenario, held_out_seed: int) -> Contender:
+def _judge_published(simulated: Scenario, held_out_seed: int) -> Contender:
     trials = judging.judge(simulated, held_out_seed)
     verdicts = judging.verdicts_of(simulated, trials, held_out_seed)
     lower_bound = judging.rms_lower_bound(simulated, held_out_seed)
     return Contender(simulated, gains.gains_of(study(simulated).parts), {}, trials, verdicts, lower_bound)
 
 
-def figures_of(contender: Contender) -> dict[str, Any]:
+def contender_results(contender: Contender) -> dict[str, Any]:
     """Return the results of a contender as in `summary.json`.
 
     Statistics use the trials that reached their end. The counts and the quantiles of the settling time use all trials.
     """
     trials = contender.trials
-    rank: Any = stats.spearmanr
-    angle, finished = trials.drawn["initial_angle"], trials.finished
-    error, interval = judging.window_error(trials)
+    rank_correlation: Any = stats.spearmanr
+    initial_angle, finished = trials.drawn["initial_angle"], trials.finished
+    error, interval = judging.rms_window_error(trials)
     settling = np.asarray(trials.metrics.settling_time)
     settled = finished & np.isfinite(settling)
     times, times_or_never = settling[settled], np.where(settled, settling, np.inf)  # infinite: the trial never settles
-    spread = times.size > 2 and vary(angle[settled]) and vary(times)
+    can_correlate = times.size > 2 and vary(initial_angle[settled]) and vary(times)
     mean = {name: float(np.mean(getattr(trials.metrics, name)[finished])) if finished.any() else None
             for name in ("peak_torque", "effort", "chattering")}  # fmt: skip
     return {
@@ -314,17 +316,17 @@ def figures_of(contender: Contender) -> dict[str, Any]:
         "unsettled": int(trials.status.size - times.size),
         "settling_time": {str(q): _quantile(times_or_never, q) for q in (0.01, 0.5, 0.99)},
         # dependence of the settling time on the initial angle: rank correlation, and medians at small and large angles
-        "settling_by_angle": float(rank(angle[settled], times)[0]) if spread else None,
-        "settling_near_far": _near_far(angle, times_or_never) if spread else None,
+        "settling_by_angle": float(rank_correlation(initial_angle[settled], times)[0]) if can_correlate else None,
+        "settling_near_far": _median_settling_times(initial_angle, times_or_never) if can_correlate else None,
         "margins": contender.margins,
-        "model_errors": {name: _perturbed_figures(other) for name, other in contender.changed.items()},
+        "model_errors": {name: _perturbed_results(other) for name, other in contender.changed.items()},
         "verdicts": [verdict.in_summary() for verdict in contender.verdicts],
     }
 
 
-def _perturbed_figures(trials: Trials) -> dict[str, Any]:
+def _perturbed_results(trials: Trials) -> dict[str, Any]:
     """Return the results of trials with a model error that the law does not know."""
-    error, interval = judging.window_error(trials)
+    error, interval = judging.rms_window_error(trials)
     return {
         "window_error": error,
         "window_error_interval": interval,
@@ -347,7 +349,7 @@ def _quantile(times: np.ndarray, q: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def _near_far(angle: np.ndarray, times: np.ndarray) -> tuple[float | None, float | None]:
+def _median_settling_times(angle: np.ndarray, times: np.ndarray) -> tuple[float | None, float | None]:
     """Return the median settling times [s] of the fifths of the trials with the smallest and largest initial angles."""
     order = np.argsort(angle)
     fifth = max(1, angle.size // 5)
@@ -356,24 +358,24 @@ def _near_far(angle: np.ndarray, times: np.ndarray) -> tuple[float | None, float
 
 def summary(comparison: Comparison) -> dict[str, Any]:
     """Return the content of `summary.json`."""
-    found = comparison.contenders
-    first = next(iter(found.values()))
+    results = comparison.contenders
+    first = next(iter(results.values()))
     return {
         "status": comparison.status,
         "seed": comparison.held_out_seed,
         "trials": int(first.trials.status.size),
         "published_unavailable": comparison.published_unavailable,
-        "published_label": gains.published_label(found[PUBLISHED].simulated) if PUBLISHED in found else None,
+        "published_label": gains.published_label(results[PUBLISHED].simulated) if PUBLISHED in results else None,
         "judged_on": "flight clock",  # no sign function is named here, because the laws have different ones
         "settling_angle": first.simulated.loop.settling_angle,
-        "laws": {law: figures_of(contender) for law, contender in found.items()},
+        "laws": {law: contender_results(contender) for law, contender in results.items()},
         "warnings": list(
-            dict.fromkeys(text for one in found.values() for text in plausibility.warnings(one.simulated))
+            dict.fromkeys(text for contender in results.values() for text in plausibility.warnings(contender.simulated))
         ),
     }
 
 
-def write(folder: Path, scenario: Scenario, comparison: Comparison, figures: bool, known_by: Mapping[str, Any]) -> None:
+def write(folder: Path, scenario: Scenario, comparison: Comparison, figures: bool, identity: Mapping[str, Any]) -> None:
     """Write a result folder: `summary.json`, `compare.csv`, a scenario for each law, and figures.
 
     Args:
@@ -381,17 +383,17 @@ def write(folder: Path, scenario: Scenario, comparison: Comparison, figures: boo
         scenario: the scenario of the comparison.
         comparison: the results.
         figures: write figures too.
-        known_by: entries of `versions.json`, see `identity`.
+        identity: entries of `versions.json`, from the function `identity`.
     """
     content = summary(comparison)
-    store.record(folder, parsing.dump(scenario), known_by, content)
+    store.write_run_files(folder, parsing.dump(scenario), identity, content)
     (folder / "scenarios").mkdir()
     for law, contender in comparison.contenders.items():
-        tables = custom_parts.carry(parsing.dump(contender.simulated), folder / "scenarios")
+        tables = custom_parts.copy_custom_files(parsing.dump(contender.simulated), folder / "scenarios")
         store.write_toml(folder / "scenarios" / f"{law}.toml", tables)
-    store.write_csv(folder / "compare.csv", *_rows(scenario, content))
+    store.write_csv(folder / "compare.csv", *_csv_table(scenario, content))
     if figures:
-        style.save(dict(_figures(comparison)), folder / "figures")
+        style.save(dict(_plot_figures(comparison)), folder / "figures")
 
 
 _QUANTILES = ("0.01", "0.5", "0.99")
@@ -399,11 +401,11 @@ _COLUMNS = ("met", "window_error", "peak_torque", "largest_peak_torque", "effort
             "settling_by_angle")  # fmt: skip
 
 
-def _rows(scenario: Scenario, content: Mapping[str, Any]) -> tuple[list[str], list[list[Any]]]:
+def _csv_table(scenario: Scenario, content: Mapping[str, Any]) -> tuple[list[str], list[list[Any]]]:
     """Return the header and the rows of `compare.csv`, one row for each law."""
     required = [name for name in catalogues.MARGINS if name in scenario.requirements]
     nominal = [name for name in catalogues.MARGINS if name not in required]  # columns of the nominal loop in hold
-    head = ["law", *_COLUMNS, *(f"settling_time_{100 * float(q):g}" for q in _QUANTILES), *required, *nominal,
+    header = ["law", *_COLUMNS, *(f"settling_time_{100 * float(q):g}" for q in _QUANTILES), *required, *nominal,
             "window_error_low", "window_error_high", *(f"window_error_{name}" for name in MODEL_ERRORS),
             "gains"]  # fmt: skip
 
@@ -417,21 +419,21 @@ def _rows(scenario: Scenario, content: Mapping[str, Any]) -> tuple[list[str], li
             "; ".join(f"{name} = {value:.6g}" for name, value in figures["gains"].items()),
         ]  # fmt: skip
 
-    return head, [row(law, figures) for law, figures in content["laws"].items()]
+    return header, [row(law, figures) for law, figures in content["laws"].items()]
 
 
-def _figures(comparison: Comparison) -> Iterator[tuple[str, Any]]:
-    sets = {law: contender.trials for law, contender in comparison.contenders.items()}
+def _plot_figures(comparison: Comparison) -> Iterator[tuple[str, Any]]:
+    trials_by_law = {law: contender.trials for law, contender in comparison.contenders.items()}
     ours = comparison.contenders[OURS]
     t_f = ours.simulated.controller.t_f
     yield "settling", study_plots.settling_by_angle(
         {law: (np.degrees(t.drawn["initial_angle"]), np.where(t.finished, t.metrics.settling_time, np.nan))
-         for law, t in sets.items()}, t_f,
+         for law, t in trials_by_law.items()}, t_f,
     )  # fmt: skip
     limit = tables.limit_of(ours.simulated, "peak_torque")
     yield "tradeoff", study_plots.tradeoff(
-        {law: (t.metrics.window_error[t.finished], t.metrics.peak_torque[t.finished]) for law, t in sets.items()
-         if t.finished.any()}, limit,
+        {law: (t.metrics.window_error[t.finished], t.metrics.peak_torque[t.finished])
+         for law, t in trials_by_law.items() if t.finished.any()}, limit,
     )  # fmt: skip
 
 

@@ -41,11 +41,11 @@ def unit_of(name: str, plant: str) -> str:
     return {**MARGINS, **CATALOGUES[plant]}[name.removeprefix("mean_")].unit
 
 
-def titled(name: str, plant: str) -> str:
+def metric_heading(name: str, plant: str) -> str:
     """Return the heading of a metric or margin over trials, with its unit for this kind of plant.
 
-    >>> titled("peak_torque", "chain"), titled("delay_margin", "chain"), titled("peak_sensitivity", "chain")
-    ('largest peak torque [u]', 'delay margin [s]', 'largest |S| [dB]')
+    >>> [metric_heading(name, "chain") for name in ("peak_torque", "delay_margin", "peak_sensitivity")]
+    ['largest peak torque [u]', 'delay margin [s]', 'largest |S| [dB]']
     """
     words = name.replace("_", " ")
     if name == "peak_sensitivity":
@@ -69,7 +69,7 @@ class Point:
     failures: int = 0  # trials that failed or did not converge at t_f
     meets: bool = False  # whether the gains meet every requirement
     trained: float = math.nan  # objective over the training trials
-    dominated: bool = False  # whether another point dominates this one, see `pareto.marked`
+    dominated: bool = False  # whether another point dominates this one, see `pareto.mark_points`
     knee: bool = False
 
     @property
@@ -98,17 +98,17 @@ class Front:
     warnings: list[str]
     published_label: str  # label of the published gains
     published_unavailable: str | None = None  # reason why the published gains cannot be simulated
-    others: dict[str, Point] = field(default_factory=dict)  # keys "published" and "before", see `judging.beside`
+    others: dict[str, Point] = field(default_factory=dict)  # see `judging.reference_scenarios`
 
     @property
-    def kept(self) -> list[Point]:
+    def non_dominated(self) -> list[Point]:
         """Return the points that no other point dominates."""
         return [point for point in self.points if not point.dominated]
 
     @property
     def status(self) -> str:
         """Return "met" if some gains of the front meet every requirement on the held-out trials, else "not met"."""
-        return "met" if any(point.meets for point in self.kept) else "not met"
+        return "met" if any(point.meets for point in self.non_dominated) else "not met"
 
     def labelled(self) -> dict[str, Point]:
         """Return the points of `others` by the labels that tables and figures show."""
@@ -121,18 +121,19 @@ class Front:
 
 def read(summary: Mapping[str, Any]) -> Front:
     """Return the front of a `summary.json`. Raises KeyError if a field is missing."""
-    known = {one.name: summary[one.name] for one in fields(Front)}
-    points = [_point(one) for one in known["points"]]
-    others = {name: _point(one) for name, one in known["others"].items()}
-    listed = {name: [_number(value) for value in known[name]] for name in ("idle", "without")}
-    return Front(**{**known, **listed, "points": points, "others": others})
+    stored = {entry.name: summary[entry.name] for entry in fields(Front)}
+    points = [_read_point(entry) for entry in stored["points"]]
+    others = {name: _read_point(entry) for name, entry in stored["others"].items()}
+    values = {name: [_nan_if_missing(value) for value in stored[name]] for name in ("idle", "without")}
+    return Front(**{**stored, **values, "points": points, "others": others})
 
 
-def _point(stored: Mapping[str, Any]) -> Point:
-    known = {one.name: stored[one.name] for one in fields(Point)}
-    numbers = {name: _number(known[name]) for name in ("value", "rms", "trained")}
-    return Point(**{**known, **numbers, "costs": {name: _number(value) for name, value in known["costs"].items()}})
+def _read_point(stored: Mapping[str, Any]) -> Point:
+    entries = {field_.name: stored[field_.name] for field_ in fields(Point)}
+    numbers = {name: _nan_if_missing(entries[name]) for name in ("value", "rms", "trained")}
+    costs = {name: _nan_if_missing(value) for name, value in entries["costs"].items()}
+    return Point(**{**entries, **numbers, "costs": costs})
 
 
-def _number(value: float | None) -> float:
+def _nan_if_missing(value: float | None) -> float:
     return math.nan if value is None else value

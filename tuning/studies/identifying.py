@@ -16,38 +16,38 @@ from ptsmc_jax.scenario.tables import Scenario
 from tuning.search import custom_parts
 
 
-def write(folder: Path, found: Identification, figures: bool, made_by: Mapping[str, Any]) -> None:
+def write(folder: Path, identification: Identification, figures: bool, made_by: Mapping[str, Any]) -> None:
     """Write a result folder: `identified.toml`, `summary.json`, `innovations.csv` and figures.
 
     Args:
         folder: an empty folder.
-        found: the estimates.
+        identification: the estimates.
         figures: write figures too.
         made_by: entries of `versions.json`.
     """
-    made = {"command": "identify", "seed": None, **made_by, **custom.checksums(found.scenario)}
-    store.record(folder, parsing.dump(found.scenario), made, results.summary(found))
-    identified = results.identified(found)
-    store.write_toml(folder / "identified.toml", custom_parts.carry(parsing.dump(identified), folder))
-    for k, fit in enumerate([*found.fits, *found.validation]):
+    versions = {"command": "identify", "seed": None, **made_by, **custom.checksums(identification.scenario)}
+    store.write_run_files(folder, parsing.dump(identification.scenario), versions, results.summary(identification))
+    identified = results.identified(identification)
+    store.write_toml(folder / "identified.toml", custom_parts.copy_custom_files(parsing.dump(identified), folder))
+    for k, fit in enumerate([*identification.fits, *identification.validation]):
         name = "innovations" if k == 0 else f"innovations_{k + 1}"
         names = results.components(fit)
         values, sigma = results.innovations(fit)
-        header = ["t", *names, *(f"{one}_sigma" for one in names)]
+        header = ["t", *names, *(f"{component}_sigma" for component in names)]
         store.write_csv(folder / f"{name}.csv", header, np.column_stack([fit.log.t[1:], values, sigma]).tolist())
     if figures:
         from ptsmc_jax.figures import identification_plots, style
 
-        style.save(identification_plots.figures_of(found), folder / "figures")
+        style.save(identification_plots.identification_figures(identification), folder / "figures")
 
 
-def design_summary(design: Design, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of `summary.json` of a design; given: its duration [s] and limits."""
+def design_summary(design: Design, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of `summary.json` of a design; settings: its duration [s] and limits."""
     rows = list(design.table().iter_rows(named=True))
-    return {"status": "designed", **given, "parameters": rows, "undetermined": design.undetermined}
+    return {"status": "designed", **settings, "parameters": rows, "undetermined": design.undetermined}
 
 
-def write_design(folder: Path, scenario: Scenario, design: Design, figures: bool, given: Mapping[str, Any]) -> None:
+def write_design(folder: Path, scenario: Scenario, design: Design, figures: bool, settings: Mapping[str, Any]) -> None:
     """Write a result folder: `profile.csv`, `summary.json` and a figure of the profile.
 
     Args:
@@ -55,10 +55,10 @@ def write_design(folder: Path, scenario: Scenario, design: Design, figures: bool
         scenario: the scenario.
         design: the proposed manoeuvre.
         figures: write figures too.
-        given: its duration [s] and limits.
+        settings: its duration [s] and limits.
     """
-    made = {"command": "identify", "seed": None, "design": True, **custom.checksums(scenario)}
-    store.record(folder, parsing.dump(scenario), made, design_summary(design, given))
+    versions = {"command": "identify", "seed": None, "design": True, **custom.checksums(scenario)}
+    store.write_run_files(folder, parsing.dump(scenario), versions, design_summary(design, settings))
     frame = design.frame
     store.write_csv(folder / "profile.csv", frame.columns, frame.rows())
     if figures:

@@ -20,7 +20,7 @@ from ptsmc_jax.simulation.requirements import Verdict
 from tuning.search import confirm, gains, trust
 
 
-def seed_of_judge(seed: int, turn: int = 0) -> int:
+def derive_held_out_seed(seed: int, turn: int = 0) -> int:
     """Return the seed of the held-out trials, which differs from the seed of the search.
 
     The hash of `draws.derive` maps one seed in 2^32 to itself for each name, for example 654735429 in turn 0.
@@ -34,7 +34,7 @@ def seed_of_judge(seed: int, turn: int = 0) -> int:
     return held_out if held_out != seed else draws.derive(seed, f"{name}, others")
 
 
-def beside(scenario: Scenario) -> tuple[dict[str, Scenario], str | None]:
+def reference_scenarios(scenario: Scenario) -> tuple[dict[str, Scenario], str | None]:
     """Return the scenarios that tuned gains are compared with, and why the published gains cannot be simulated.
 
     Returns:
@@ -47,7 +47,7 @@ def beside(scenario: Scenario) -> tuple[dict[str, Scenario], str | None]:
         study(on_flight_clock(published))
     except ScenarioError as error:
         return {"before": scenario}, str(error)
-    return {"published": published} | ({"before": scenario} if gains.differ(scenario, published) else {}), None
+    return {"published": published} | ({"before": scenario} if gains.controls_differ(scenario, published) else {}), None
 
 
 def judge(scenario: Scenario, held_out_seed: int, reach: Reach | None = None) -> Trials:
@@ -59,7 +59,8 @@ def judge(scenario: Scenario, held_out_seed: int, reach: Reach | None = None) ->
         reach: ranges of the gains that share a compiled program; None: those of the scenario.
     """
     simulated = study(on_flight_clock(scenario), reach=reach)
-    return montecarlo.run(simulated.parts, simulated.dispersion, held_out_seed, np.arange(held_out_trials(simulated)))
+    trials = np.arange(count_held_out_trials(simulated))
+    return montecarlo.run(simulated.parts, simulated.dispersion, held_out_seed, trials)
 
 
 def rms_lower_bound(scenario: Scenario, held_out_seed: int) -> float | None:
@@ -76,21 +77,22 @@ def verdicts_of(scenario: Scenario, trials: Trials, held_out_seed: int) -> list[
         held_out_seed: seed of these trials.
     """
     ready = study(on_flight_clock(scenario))
-    one = 0 if trials.status.size == 1 else slice(None)  # a required fraction has no meaning for one nominal trial
+    # a required fraction has no meaning for one nominal trial
+    selection = 0 if trials.status.size == 1 else slice(None)
 
     def values(name: str) -> np.ndarray:
-        return getattr(trials.metrics, name)[one]
+        return getattr(trials.metrics, name)[selection]
 
-    simulated = requirements.verdicts(ready.requirements, values, trials.finished[one])
-    return [*simulated, *margin_verdicts.of_trials(ready, held_out_seed)]
+    simulated = requirements.verdicts(ready.requirements, values, trials.finished[selection])
+    return [*simulated, *margin_verdicts.judge_trials(ready, held_out_seed)]
 
 
-def met(verdicts: Sequence[Verdict], trials: Trials) -> bool:
+def meets_requirements(verdicts: Sequence[Verdict], trials: Trials) -> bool:
     """Return whether every requirement is met, every trial reaches its end, and every trial converges by t_f."""
     return all(v.met for v in verdicts) and bool(np.all(trials.ok))
 
 
-def window_error(trials: Trials) -> tuple[float | None, tuple[float, float] | None]:
+def rms_window_error(trials: Trials) -> tuple[float | None, tuple[float, float] | None]:
     """Return the RMS window error of the trials that reached their end, and its confidence interval.
 
     The error is None if no trial reached its end.
@@ -99,7 +101,7 @@ def window_error(trials: Trials) -> tuple[float | None, tuple[float, float] | No
     return float(trust.rms(errors)) if errors.size else None, trust.interval(errors, trust.rms)
 
 
-def largest(name: str, scenario: Scenario, trials: Trials) -> float:
+def required_quantile(name: str, scenario: Scenario, trials: Trials) -> float:
     """Return the value that a metric stays below in the required fraction of the trials, in the metric's unit.
 
     Failed trials count as larger than all others, as in the verdict. If more trials fail than the fraction allows, the
@@ -114,8 +116,8 @@ def largest(name: str, scenario: Scenario, trials: Trials) -> float:
         The value; NaN if no trial reaches its end.
     """
     values = np.sort(np.asarray(getattr(trials.metrics, name))[trials.finished])
-    asked = scenario.requirements.get(name)
-    fraction = (asked.fraction if isinstance(asked, Limit) else None) or 1.0
+    requirement = scenario.requirements.get(name)
+    fraction = (requirement.fraction if isinstance(requirement, Limit) else None) or 1.0
     return statistics.value_at(values, min(1.0, fraction * trials.status.size / values.size)) if values.size else np.nan
 
 
@@ -124,23 +126,23 @@ def on_flight_clock(scenario: Scenario) -> Scenario:
     return replace(scenario, loop__clock="flight") if scenario.sampled else scenario
 
 
-def judged_on(simulated: Scenario) -> str:
+def describe_simulation(simulated: Scenario) -> str:
     """Return the clock and the sign function of the simulations in words, for reports."""
     if not simulated.sampled:
         return "the continuous loop"
     if getattr(simulated.controller, "implicit", False):
         return "flight clock, implicit sampling"
-    width = getattr(simulated.controller, "sign_width", None)
-    if width is None:
+    sign_width = getattr(simulated.controller, "sign_width", None)
+    if sign_width is None:
         return "flight clock"
-    return "flight clock, " + (f"boundary layer of {width:g}" if width else "discontinuous sign")
+    return "flight clock, " + (f"boundary layer of {sign_width:g}" if sign_width else "discontinuous sign")
 
 
-def trials_of(ready: Study, count: int) -> int:
+def count_needed_trials(ready: Study, count: int) -> int:
     """Return the number of trials to simulate: 1 if all trials are equal, else `count`."""
     return count if ready.drawn else 1
 
 
-def held_out_trials(ready: Study) -> int:
+def count_held_out_trials(ready: Study) -> int:
     """Return the number of held-out trials of a judgement."""
-    return trials_of(ready, confirm.held_out_trials(ready.requirements))
+    return count_needed_trials(ready, confirm.held_out_trials(ready.requirements))

@@ -18,7 +18,7 @@ from ptsmc_jax.scenario import parsing, plausibility, study, tables
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.timing import Reach
 from tuning.search import gains, trust
-from tuning.search.evolution import NEARBY
+from tuning.search.evolution import NEAR_BEST
 from tuning.search.journal import Journal
 from tuning.search.local_search import Best
 from tuning.search.local_searches import LocalSearches
@@ -26,80 +26,88 @@ from tuning.search.objective import Problem
 from tuning.search.progress import Report
 from tuning.search.rounds import MARGIN
 from tuning.studies import judging, posing
-from tuning.studies.front import KINDS, Front, Point, titled
+from tuning.studies.front import KINDS, Front, Point, metric_heading
 from tuning.studies.trades import SENSITIVITY, TORQUE, Target, Trade
 
-WARM = 3  # starting points of a target among the known gains
-NEARLY = 0.05  # known gains that violate a limit by less than this fraction are starting points like feasible ones
+WARM_STARTS = 3  # starting points of a target among the known gains
+# known gains that violate a limit by less than this fraction are starting points like feasible ones
+NEARLY_FEASIBLE = 0.05
 STEPS = 40  # largest number of evaluations from each starting point
-APART = 1e-3  # smallest distance of two points, as a fraction of the bounds' intervals
+SMALLEST_DISTANCE = 1e-3  # smallest distance of two points, as a fraction of the bounds' intervals
 
-Judged = tuple[Point, Trials]
+JudgedPoint = tuple[Point, Trials]
 
 
-def trace(trade: Trade, seed: int, tell: Report = lambda *_: None, journal: Journal | None = None) -> Front:
+def trace(trade: Trade, seed: int, report: Report = lambda *_: None, journal: Journal | None = None) -> Front:
     """Find the front of a trade. Raises KeyboardInterrupt on Ctrl-C.
 
     Args:
         trade: the scenario, and the quantity that its window error is traded against.
         seed: seed of the search. The seed of the held-out trials follows from it.
-        tell: called with the progress after every step.
+        report: called with the progress after every step.
         journal: evaluations of an interrupted search, which then resumes.
     """
-    posed = posing.tuning_problem(trade.base, seed, journal, **trade.farther)
-    reach = posing.reach(trade.base, trade.base.search, **trade.farther) if trade.farther else None
-    targets, known = trade.targets(posed, tell)
-    best = refined(targets, known, posed, tell)
-    chosen, held_out_seed, judged = apart(best) if trade.merged else best, judging.seed_of_judge(seed), []
+    setup = posing.set_up_tuning(trade.base, seed, journal, **trade.reach_overrides)
+    overrides = trade.reach_overrides
+    reach = posing.tuning_reach(trade.base, trade.base.search, **overrides) if overrides else None
+    targets, known_gains = trade.targets(setup, report)
+    best = refine_targets(targets, known_gains, setup, report)
+    chosen = drop_equal_gains(best) if trade.merges_points else best
+    held_out_seed, judged = judging.derive_held_out_seed(seed), []
     for done, k in enumerate(sorted(chosen)):
-        tell("judging on held-out trials", done, len(chosen), np.nan, 0.0)
-        found, value = posed.named(chosen[k].normalised), targets[k].value
-        tuned = trade.tuned(value, found)
-        judged.append(_judged(trade, Point(value, found, trained=chosen[k].value), tuned, held_out_seed, reach))
-    others, refused = judging.beside(trade.scenario) if trade.compared else ({}, None)
+        report("judging on held-out trials", done, len(chosen), np.nan, 0.0)
+        tuned_gains, value = setup.rounded_gains(chosen[k].normalised), targets[k].value
+        tuned = trade.tuned_scenario(value, tuned_gains)
+        point = Point(value, tuned_gains, trained=chosen[k].value)
+        judged.append(_judge_point(trade, point, tuned, held_out_seed, reach))
+    references, published_error = judging.reference_scenarios(trade.scenario) if trade.compares_points else ({}, None)
     scenario = trade.scenario
 
-    def reference(one: Scenario) -> Point:
-        return _judged(trade, Point(np.nan, gains.gains_of(study(one).parts)), one, held_out_seed, reach)[0]
+    def judge_reference(compared: Scenario) -> Point:
+        point = Point(np.nan, gains.gains_of(study(compared).parts))
+        return _judge_point(trade, point, compared, held_out_seed, reach)[0]
 
     return Front(
         against=trade.against,
         plant=scenario.plant.kind,
-        points=marked(judged) if trade.compared else [point for point, _ in judged],
+        points=mark_points(judged) if trade.compares_points else [point for point, _ in judged],
         idle=[targets[k].value for k in best if k not in chosen],
         without=[target.value for k, target in enumerate(targets) if k not in best],
         trials=judged[0][1].status.size if judged else 0,
         seed=held_out_seed,
         interval_confidence=trust.CONFIDENCE,
-        lower_bound=None if trade.farther else judging.rms_lower_bound(scenario, held_out_seed),  # depends on t_f
-        rollouts=posed.evaluate.rollouts,
-        gradients=posed.evaluate.gradients,
+        lower_bound=None if overrides else judging.rms_lower_bound(scenario, held_out_seed),  # depends on t_f
+        rollouts=setup.evaluate.rollouts,
+        gradients=setup.evaluate.gradients,
         requirements=list(scenario.requirements),
         gain_units=gains.units_of(scenario),
         warnings=plausibility.warnings(scenario),
         published_label=gains.published_label(scenario),
-        published_unavailable=refused,
-        others={name: reference(one) for name, one in others.items()},
+        published_unavailable=published_error,
+        others={name: judge_reference(compared) for name, compared in references.items()},
     )
 
 
-def _judged(trade: Trade, point: Point, tuned: Scenario, seed: int, reach: Reach | None) -> Judged:
+def _judge_point(trade: Trade, point: Point, tuned: Scenario, seed: int, reach: Reach | None) -> JudgedPoint:
     """Return a point with its results on the held-out trials of this seed, and these trials."""
     trials = judging.judge(tuned, seed, reach)
-    rms, interval = judging.window_error(trials)
-    met, costs = judging.met(judging.verdicts_of(tuned, trials, seed), trials), trade.costs(tuned, trials, seed)
-    found = {"rms": np.nan if rms is None else rms, "interval": interval, "failures": int(np.sum(~trials.ok))}
-    return replace(point, costs=costs, meets=met, **found), trials
+    rms, interval = judging.rms_window_error(trials)
+    met = judging.meets_requirements(judging.verdicts_of(tuned, trials, seed), trials)
+    costs = trade.costs(tuned, trials, seed)
+    results = {"rms": np.nan if rms is None else rms, "interval": interval, "failures": int(np.sum(~trials.ok))}
+    return replace(point, costs=costs, meets=met, **results), trials
 
 
-def refined(targets: Sequence[Target], known: list[np.ndarray], posed: posing.Posed, tell: Report) -> dict[int, Best]:
+def refine_targets(
+    targets: Sequence[Target], known_gains: list[np.ndarray], setup: posing.TuningSetup, report: Report
+) -> dict[int, Best]:
     """Improve the gains of all targets from the last to the first and back, each from the gains known by then.
 
     Args:
         targets: the targets in the order of their values.
-        known: gains as fractions of the bounds' intervals, (gains,) each; the gains found are added.
-        posed: evaluates gains.
-        tell: called with the progress.
+        known_gains: gains as fractions of the bounds' intervals, (gains,) each; the gains found are added.
+        setup: evaluates gains.
+        report: called with the progress.
 
     Returns:
         The best gains by the index of their target. A target without gains that keep its limits is missing.
@@ -107,51 +115,51 @@ def refined(targets: Sequence[Target], known: list[np.ndarray], posed: posing.Po
     best: dict[int, Best] = {}
     order = [*reversed(range(len(targets))), *range(len(targets))]
     for done, k in enumerate(order):
-        tell(f"refining, {targets[k].name}", done, len(order), np.nan, 0.0)
-        found = _refined(posed, targets[k].problem, np.unique(np.asarray(known), axis=0))
-        if found is not None and (k not in best or found.f < best[k].f):
-            best[k] = found
-            known.append(found.normalised)
+        report(f"refining, {targets[k].name}", done, len(order), np.nan, 0.0)
+        candidate = _refine_gains(setup, targets[k].problem, np.unique(np.asarray(known_gains), axis=0))
+        if candidate is not None and (k not in best or candidate.f < best[k].f):
+            best[k] = candidate
+            known_gains.append(candidate.normalised)
     return best
 
 
-def _refined(posed: posing.Posed, problem: Problem, known: np.ndarray) -> Best | None:
+def _refine_gains(setup: posing.TuningSetup, problem: Problem, known_gains: np.ndarray) -> Best | None:
     """Return the best feasible gains, known ones or those of searches from the most promising known ones."""
-    run = LocalSearches(posed.evaluate, MARGIN, STEPS, np.random.default_rng(0))
-    simulated = posed.evaluate.measure(run.tightened(problem), known)
-    chosen = known[np.lexsort((simulated.f, np.maximum(simulated.largest_c - NEARLY, 0.0)))[:WARM]]
-    best = Best(known[0], len(problem.rows), MARGIN)
-    best.offer(known, simulated)
-    if posed.with_gradients:
-        run.search_locally(problem, dict(enumerate(chosen)))
+    searches = LocalSearches(setup.evaluate, MARGIN, STEPS, np.random.default_rng(0))
+    results = setup.evaluate.measure(searches.tightened(problem), known_gains)
+    starts = known_gains[np.lexsort((results.f, np.maximum(results.largest_c - NEARLY_FEASIBLE, 0.0)))[:WARM_STARTS]]
+    best = Best(known_gains[0], len(problem.rows), MARGIN)
+    best.offer(known_gains, results)
+    if setup.with_gradients:
+        searches.search_locally(problem, dict(enumerate(starts)))
     else:
-        run.evolve(problem, chosen[0], NEARBY)
-    best = min(best, run.best, key=lambda one: one.rank) if run.started else best
+        searches.evolve(problem, starts[0], NEAR_BEST)
+    best = min(best, searches.best, key=lambda candidate: candidate.rank) if searches.started else best
     return best if best.violation == 0.0 else None
 
 
-def apart(best: dict[int, Best]) -> dict[int, Best]:
+def drop_equal_gains(best: dict[int, Best]) -> dict[int, Best]:
     """Return the first target of each group with the same gains, because the limits of the others are not active."""
-    kept: dict[int, Best] = {}
+    distinct: dict[int, Best] = {}
     for k in sorted(best):
-        if all(np.abs(best[k].normalised - other.normalised).max() >= APART for other in kept.values()):
-            kept[k] = best[k]
-    return kept
+        if all(np.abs(best[k].normalised - other.normalised).max() >= SMALLEST_DISTANCE for other in distinct.values()):
+            distinct[k] = best[k]
+    return distinct
 
 
-def marked(judged: Sequence[Judged]) -> list[Point]:
+def mark_points(judged: Sequence[JudgedPoint]) -> list[Point]:
     """Return the points in order of peak torque, with dominated points and the knee marked."""
     pairs = sorted(judged, key=lambda pair: pair[0].peak)
     points = [replace(pair[0], dominated=any(_dominates(other, pair) for other in pairs)) for pair in pairs]
     # logarithms need positive numbers, which exist if a trial ends
     front = [k for k, p in enumerate(points) if not p.dominated and p.peak > 0.0 and p.rms > 0.0]
     if len(front) > 2:
-        knee = front[knee_of(np.asarray([[points[k].peak, points[k].rms] for k in front]))]
+        knee = front[find_knee(np.asarray([[points[k].peak, points[k].rms] for k in front]))]
         points[knee] = replace(points[knee], knee=True)
     return points
 
 
-def _dominates(one: Judged, other: Judged) -> bool:
+def _dominates(one: JudgedPoint, other: JudgedPoint) -> bool:
     """Return whether a point needs no more torque and is more accurate, beyond the interval of the ratio.
 
     A point with more failed trials dominates no other. A single trial, without dispersions, has no interval.
@@ -165,18 +173,18 @@ def _dominates(one: Judged, other: Judged) -> bool:
     return trials.status.size == 1 if interval is None else interval[0] > 1.0
 
 
-def knee_of(points: np.ndarray) -> int:
+def find_knee(points: np.ndarray) -> int:
     """Return the index of the point farthest below the line between the ends of a front, in logarithms.
 
     Args:
         points: peak torque and error (count, 2), in order along the front.
     """
-    off = np.log(points) - np.log(points[0])
-    along = off[-1]  # a scaled axis changes all distances by the same factor
-    return int(np.argmax(off[:, 0] * along[1] - off[:, 1] * along[0]))
+    log_offsets = np.log(points) - np.log(points[0])
+    chord = log_offsets[-1]  # a scaled axis changes all distances by the same factor
+    return int(np.argmax(log_offsets[:, 0] * chord[1] - log_offsets[:, 1] * chord[0]))
 
 
-def write(folder: Path, trade: Trade, front: Front, figures: bool, known_by: dict[str, Any]) -> None:
+def write(folder: Path, trade: Trade, front: Front, figures: bool, identity: dict[str, Any]) -> None:
     """Write a result folder: `summary.json`, a CSV file with the points, and a figure.
 
     Args:
@@ -184,16 +192,16 @@ def write(folder: Path, trade: Trade, front: Front, figures: bool, known_by: dic
         trade: the scenario and the traded quantity.
         front: the results.
         figures: write the figure too.
-        known_by: entries of `versions.json`, see `Trade.identity`.
+        identity: entries of `versions.json`, see `Trade.identity`.
     """
-    kind, names = KINDS[front.against], gains.named(trade.scenario)
-    store.record(folder, parsing.dump(trade.scenario), known_by, front.summary())
+    kind, names = KINDS[front.against], gains.free_gain_names(trade.scenario)
+    store.write_run_files(folder, parsing.dump(trade.scenario), identity, front.summary())
     error, marks = ("rms_window_error", "rms_low", "rms_high"), ("dominated", "knee", "trained_objective")
     costs = front.points[0].costs if front.points else ()
-    header = [kind.column, *names, *error, *costs, "failures", "meets", *(marks if trade.compared else ())]
+    header = [kind.column, *names, *error, *costs, "failures", "meets", *(marks if trade.compares_points else ())]
     rows = [
         [p.value, *(p.gains[name] for name in names), p.rms, *(p.interval or ("", "")), *p.costs.values(), p.failures,
-         int(p.meets), *((int(p.dominated), int(p.knee), p.trained) if trade.compared else ())]
+         int(p.meets), *((int(p.dominated), int(p.knee), p.trained) if trade.compares_points else ())]
         for p in front.points
     ]  # fmt: skip
     store.write_csv(folder / f"{kind.file}.csv", header, rows)
@@ -204,15 +212,15 @@ def write(folder: Path, trade: Trade, front: Front, figures: bool, known_by: dic
 def figure_of(trade: Trade, front: Front) -> Figure:
     """Plot the error over the peak torque, or the error and the costs over the traded quantity."""
     kind, scenario = KINDS[front.against], trade.scenario
-    if trade.compared:
+    if trade.compares_points:
         limit = tables.limit_of(scenario, TORQUE)
         return study_plots.front(front.points, front.labelled(), limit, front.plant, front.lower_bound)
-    shown, error, unit = style.shown_error(front.plant)
+    to_shown_unit, error, unit = style.error_display(front.plant)
     limit = tables.limit_of(scenario, "window_error")
-    rms = shown([one.rms for one in front.points])
-    panels = {f"RMS {error} in the window [{unit}]": (rms, None if limit is None else float(shown(limit)))} | {
-        titled(name, front.plant): (
-            np.array([one.costs[name] for one in front.points]),
+    rms = to_shown_unit([point.rms for point in front.points])
+    panels = {f"RMS {error} in the window [{unit}]": (rms, None if limit is None else float(to_shown_unit(limit)))} | {
+        metric_heading(name, front.plant): (
+            np.array([point.costs[name] for point in front.points]),
             tables.limit_of(scenario, name),
         )
         for name in front.points[0].costs
@@ -221,12 +229,12 @@ def figure_of(trade: Trade, front: Front) -> Figure:
     panels = {
         title: (np.where(np.isfinite(column), column, np.nan), limit) for title, (column, limit) in panels.items()
     }
-    values = [one.value for one in front.points]
+    values = [point.value for point in front.points]
     finite = [value for value in values if np.isfinite(value)]
     # the point without a limit is as far from the loosest limit as the next limit
-    beyond = 2.0 * finite[0] - finite[1] if len(finite) > 1 else sum(finite) + 1.0
+    no_limit_place = 2.0 * finite[0] - finite[1] if len(finite) > 1 else sum(finite) + 1.0
     ticks = [f"{value:g}" if np.isfinite(value) else "none" for value in values] if len(finite) < len(values) else None
-    places = [value if np.isfinite(value) else beyond for value in values]
+    places = [value if np.isfinite(value) else no_limit_place for value in values]
     title = f"{kind.title}, held-out trials"
     return study_plots.costs(
         front.points, study_plots.Sweep(title, kind.label(front.plant), places, ticks), panels, front.plant

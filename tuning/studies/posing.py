@@ -1,6 +1,6 @@
 """Turn a scenario into a tuning problem: training trials, limits, bounds of the gains, starting points.
 
-`tuning_problem` builds the problem, and `Posed.search` solves it. Read `tuning_problem` first.
+`set_up_tuning` builds the problem, and `TuningSetup.search` solves it. Read `set_up_tuning` first.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ DIGITS = 10  # significant digits of reported gains; the rounded gains are judge
 
 
 @dataclass(frozen=True)
-class Posed:
+class TuningSetup:
     """A scenario's tuning problem over its training trials, and the evaluator of gains."""
 
     ready: Study
@@ -35,16 +35,16 @@ class Posed:
     evaluate: Evaluator
     scenario_gains: np.ndarray  # (gains,) gains of the scenario
     with_gradients: bool  # whether F has useful gradients; it has none with the discontinuous sign
-    asked: list[Requirement]  # constraints of the search
+    constraints: list[Requirement]  # constraints of the search
     seed: int
-    designs: np.ndarray  # (designs, gains) starting points that follow from the mission
+    design_gains: np.ndarray  # (designs, gains) starting points that follow from the mission
 
     def search(
         self,
         problem: Problem,
         gains: np.ndarray,
         starts: int,
-        asked: Sequence[Requirement] | None = None,
+        constraints: Sequence[Requirement] | None = None,
         *,
         judged: bool = True,
         margins: Mapping[str, float] | None = None,
@@ -56,18 +56,25 @@ class Posed:
             problem: the objective and its constraints.
             gains: first starting point (gains,), in the units of the gains.
             starts: number of starting points.
-            asked: requirements that the search keeps; None: `self.asked`.
+            constraints: requirements that the search keeps; None: `self.constraints`.
             judged: see `Settings`.
             margins: distance from the limit of each metric as a fraction of the limit, see `Settings`.
             callbacks: `report` and `prepare` of `search`.
         """
-        table, asked = self.ready.scenario.search, self.asked if asked is None else asked
+        table, constraints = self.ready.scenario.search, self.constraints if constraints is None else constraints
         settings = Settings(
-            starts, table.steps, self.seed, self.with_gradients, table.worst_case, judged, margins or {}, self.designs
+            starts,
+            table.steps,
+            self.seed,
+            self.with_gradients,
+            table.worst_case,
+            judged,
+            margins or {},
+            self.design_gains,
         )
-        return search(self.evaluate, problem, asked, gains, settings, **callbacks)
+        return search(self.evaluate, problem, constraints, gains, settings, **callbacks)
 
-    def named(self, normalised: np.ndarray) -> dict[str, float]:
+    def rounded_gains(self, normalised: np.ndarray) -> dict[str, float]:
         """Return rounded gains by name from normalised gains, (gains,)."""
         return self.evaluate.bounds.rounded(self.evaluate.bounds.gains(normalised), DIGITS)
 
@@ -75,97 +82,99 @@ class Posed:
 def with_tune(scenario: Scenario) -> Scenario:
     """Return the scenario with a table `tune`. Raises ScenarioError without a free gain."""
     scenario = scenario if scenario.tune is not None else replace(scenario, tune={})
-    free_gains.need_some(scenario)
+    free_gains.require_free_gains(scenario)
     return scenario
 
 
-def with_bounds(scenario: Scenario, moved: Mapping[str, tuple[float, float]]) -> Scenario:
+def with_bounds(scenario: Scenario, new_bounds: Mapping[str, tuple[float, float]]) -> Scenario:
     """Return the scenario with other bounds of some gains. These bounds still count as default bounds."""
-    tune = msgspec.structs.replace(scenario.search, bounds={**scenario.search.bounds, **moved})
+    tune = msgspec.structs.replace(scenario.search, bounds={**scenario.search.bounds, **new_bounds})
     return msgspec.structs.replace(scenario, tune=tune)
 
 
-def tuning_problem(scenario: Scenario, seed: int, journal: Journal | None = None, **farther: float) -> Posed:
+def set_up_tuning(scenario: Scenario, seed: int, journal: Journal | None = None, **overrides: float) -> TuningSetup:
     """Return the tuning problem of a scenario.
 
     Args:
         scenario: scenario with free gains.
         seed: seed of the training trials and the search.
         journal: stored evaluations, which are not simulated again.
-        farther: see `reach`.
+        overrides: see `tuning_reach`.
     """
-    scenario, table = as_trained(scenario), scenario.search
-    ready = study(scenario, reach=reach(scenario, table, **farther))
-    bounds = gain_bounds.of_scenario(scenario, ready.parts)
-    asked = [r.implied_by for r in ready.requirements]
-    trained = judging.trials_of(ready, table.trials)
-    may_break = [confirm.may_break(r, asked, trained) for r in asked]
+    scenario, tune = on_training_clock(scenario), scenario.search
+    ready = study(scenario, reach=tuning_reach(scenario, tune, **overrides))
+    bounds = gain_bounds.bounds_of_scenario(scenario, ready.parts)
+    requirements = [r.implied_by for r in ready.requirements]
+    training_trials = judging.count_needed_trials(ready, tune.trials)
+    may_break = [confirm.allowed_in_training(r, requirements, training_trials) for r in requirements]
     problem = objective.problem(
         ready.parts,
         ready.dispersion,
         seed,
-        np.arange(trained),
+        np.arange(training_trials),
         bounds.names,
-        asked,
-        may_break=tuple(allowed for allowed, _ in may_break),
+        requirements,
+        may_break=tuple(count for count, _ in may_break),
         banded=tuple(banded for _, banded in may_break),
-        objective=table.minimise,
-        tail=_tail(table, trained),
-        statistic=table.statistic,
-        torque_weight=table.torque_weight,
+        objective=tune.minimise,
+        tail=_count_tail_trials(tune, training_trials),
+        statistic=tune.statistic,
+        torque_weight=tune.torque_weight,
     )
-    exact = scenario.exact_sign and "sign_width" not in bounds.names
-    if not exact:  # start before the margins, so that these programs compile meanwhile
-        simulations.prepare(problem.batch, objective.watched(problem))
-    problem = dataclasses.replace(problem, margins=margin_rows.ask(ready, bounds, seed))
+    is_discontinuous = scenario.has_discontinuous_sign and "sign_width" not in bounds.names
+    if not is_discontinuous:  # start before the margins, so that these programs compile meanwhile
+        simulations.prepare(problem.batch, objective.needed_metrics(problem))
+    problem = dataclasses.replace(problem, margins=margin_rows.build_required_margins(ready, bounds, seed))
     scenario_gains = np.asarray(gains.present_values(ready.parts, bounds.names))
     designs = np.asarray(gains.design_gains(scenario, ready.parts, bounds.names))
-    return Posed(ready, problem, Evaluator(bounds, journal), scenario_gains, not exact, asked, seed, designs)
+    return TuningSetup(
+        ready, problem, Evaluator(bounds, journal), scenario_gains, not is_discontinuous, requirements, seed, designs
+    )
 
 
-def as_trained(scenario: Scenario) -> Scenario:
+def on_training_clock(scenario: Scenario) -> Scenario:
     """Return the scenario on the anchored clock, which has a sample at t_f - delta, if delta or t_f is tuned.
 
     A flight computer hands over at its first sample at or after t_f - delta. On the flight clock, small changes of
     delta therefore have no effect, and the gradient is zero.
     """
-    moved = scenario.sampled and any(name in gain_bounds.TIMES for name in gains.named(scenario))
-    return replace(scenario, loop__clock="anchored") if moved else scenario
+    has_free_time = scenario.sampled and any(name in gain_bounds.TIMES for name in gains.free_gain_names(scenario))
+    return replace(scenario, loop__clock="anchored") if has_free_time else scenario
 
 
-def reach(scenario: Scenario, table: tables.Tune, **farther: float) -> Reach:
+def tuning_reach(scenario: Scenario, table: tables.Tune, **overrides: float) -> Reach:
     """Return the ranges of the free gains that one compiled program must cover.
 
     Args:
         scenario: its gains are in the ranges.
         table: its bounds are in the ranges.
-        farther: fields of `Reach` that get other values.
+        overrides: fields of `Reach` that get other values.
     """
-    present = reach_of(scenario)
+    scenario_reach = reach_of(scenario)
 
     def interval(name: str, lower: float, upper: float | None = None) -> tuple[float, float]:
         low, high = table.bounds.get(name, (lower, lower))
         return min(low, lower), max(high, lower if upper is None else upper)
 
-    smallest_delta, delta = interval("delta", present.delta)
-    smallest_t_f, t_f = interval("t_f", present.t_f)
-    gain, largest_gain = interval("observer_gain", present.gain, present.largest_gain)
-    by_gains = dataclasses.replace(
-        present,
+    smallest_delta, delta = interval("delta", scenario_reach.delta)
+    smallest_t_f, t_f = interval("t_f", scenario_reach.t_f)
+    gain, largest_gain = interval("observer_gain", scenario_reach.gain, scenario_reach.largest_gain)
+    covered = dataclasses.replace(
+        scenario_reach,
         smallest_t_f=smallest_t_f,
         t_f=t_f,
         delta=delta,
         smallest_delta=smallest_delta,
         gain=gain,
         largest_gain=largest_gain,
-        k1=interval("k1", present.k1)[1],
-        sign_width=interval("sign_width", present.sign_width)[0],
-        surface_rate=interval("surface_rate", present.surface_rate)[1],
+        k1=interval("k1", scenario_reach.k1)[1],
+        sign_width=interval("sign_width", scenario_reach.sign_width)[0],
+        surface_rate=interval("surface_rate", scenario_reach.surface_rate)[1],
     )
-    return dataclasses.replace(by_gains, **farther)
+    return dataclasses.replace(covered, **overrides)
 
 
-def _tail(table: tables.Tune, trials: int) -> int | None:
+def _count_tail_trials(table: tables.Tune, trials: int) -> int | None:
     """Return the number of worst training trials that define the objective, or None if all trials do."""
     if table.statistic in ("rms", "mean"):
         return None

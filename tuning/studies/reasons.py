@@ -1,4 +1,4 @@
-"""`ptsmc why`: compare the inputs of the worst trials of a campaign with the inputs of all trials. Read `why` first."""
+"""`ptsmc worst --why`: compare the inputs of the worst trials of a campaign with the inputs of all trials."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,11 +13,11 @@ from tuning.studies import campaign_summary
 from tuning.studies.campaign_folder import Folder
 
 
-def why(folder: Folder, metrics: Sequence[str], count: int) -> list[dict[str, Any]]:
+def explain_worst_trials(folder: Folder, metrics: Sequence[str], count: int) -> list[dict[str, Any]]:
     """Return the inputs of the worst trials by each metric, compared with the inputs of all trials.
 
-    Failed trials come first, as in `campaign_summary.worst`. If several inputs order the trials equally, only the first
-    of them is listed.
+    Failed trials come first, as in `campaign_summary.worst_trials`. If several inputs order the trials equally, only
+    the first of them is listed.
 
     Args:
         folder: the campaign.
@@ -30,40 +30,40 @@ def why(folder: Folder, metrics: Sequence[str], count: int) -> list[dict[str, An
         "rank_correlation" and "first_order" are the sensitivities of the metric, see `statistics.drivers`. They are
         None if too few trials have a value. "trials" is the number of trials with a value.
     """
-    parts, unit_of = folder.whole_parts(), folder.units
-    drawn = campaign_summary.drawn_columns(folder, parts)
-    frame = rows.read(parts, ["trial", "status", *dict.fromkeys((*metrics, *drawn))]).head(folder.trials)
-    inputs = {name: frame[name].to_numpy().astype(float) for name in drawn}
+    parts, unit_of = folder.intact_parts(), folder.units
+    input_names = campaign_summary.input_columns(folder, parts)
+    frame = rows.read(parts, ["trial", "status", *dict.fromkeys((*metrics, *input_names))]).head(folder.trials)
+    inputs = {name: frame[name].to_numpy().astype(float) for name in input_names}
     varied = {name: values for name, values in inputs.items() if statistics.vary(values)}
     distinct = statistics.distinct({name: values for name, values in varied.items() if name not in CATEGORIES})
     names = [name for name in varied if name in distinct or name in CATEGORIES]
-    failed = ~running.finished(frame)
-    explained: list[dict[str, Any]] = []
+    failed = ~running.has_finished(frame)
+    entries: list[dict[str, Any]] = []
     for metric in metrics:
         values = frame[metric].fill_null(float("nan")).to_numpy()
-        known = np.isfinite(values) & ~failed
-        of = {name: inputs[name][known] for name in names}
-        drivers = statistics.drivers(of, values[known], categories=CATEGORIES) if known.any() else {}
-        for at in campaign_summary.most_extreme(metric, values, failed, count):
-            explained += [
+        has_value = np.isfinite(values) & ~failed
+        known_inputs = {name: inputs[name][has_value] for name in names}
+        drivers = statistics.drivers(known_inputs, values[has_value], categories=CATEGORIES) if has_value.any() else {}
+        for index in campaign_summary.most_extreme(metric, values, failed, count):
+            entries += [
                 {
                     "metric": metric,
-                    "trial": int(frame["trial"][int(at)]),
-                    "value": float(values[at]) if np.isfinite(values[at]) else None,
+                    "trial": int(frame["trial"][int(index)]),
+                    "value": float(values[index]) if np.isfinite(values[index]) else None,
                     "input": name,
-                    "drawn": float(inputs[name][at]),
+                    "drawn": float(inputs[name][index]),
                     "unit": unit_of.get(name, ""),
-                    **_among(name, inputs[name], float(inputs[name][at])),
+                    **_rank_input(name, inputs[name], float(inputs[name][index])),
                     **drivers.get(name, {"rank_correlation": None, "first_order": None}),
-                    "trials": int(known.sum()),
+                    "trials": int(has_value.sum()),
                 }
                 for name in names
             ]
-    return explained
+    return entries
 
 
-def _among(name: str, values: np.ndarray, drawn: float) -> dict[str, float | None]:
+def _rank_input(name: str, values: np.ndarray, value: float) -> dict[str, float | None]:
     """Return the percentile rank of an input among all trials, or the fraction of equal trials for a category."""
     if name in CATEGORIES:
-        return {"percentile": None, "median": None, "fraction": float(np.mean(values == drawn))}
-    return {"percentile": statistics.percentile(values, drawn), "median": float(np.median(values)), "fraction": None}
+        return {"percentile": None, "median": None, "fraction": float(np.mean(values == value))}
+    return {"percentile": statistics.percentile(values, value), "median": float(np.median(values)), "fraction": None}

@@ -47,8 +47,8 @@ def summary(reproduction: Reproduction) -> dict[str, Any]:
         "claims": [asdict(claim) for claim in reproduction.claims],
         "slips": [asdict(slip) for slip in reproduction.slips],
         "observers": [
-            {key: value for key, value in asdict(one).items() if key not in ("t", "off")}
-            for one in reproduction.observers
+            {key: value for key, value in asdict(measured).items() if key not in ("t", "off")}
+            for measured in reproduction.observers
         ],
         "cases": {
             name: {"figures": claims.CASES[name][0], "status": run.status, **run.metrics}
@@ -90,12 +90,12 @@ def figures_of(reproduction: Reproduction) -> dict[str, Figure]:
         )
         figures[f"fig_{int(last):02}{letters[1]}_{torque}"] = run_plots.torque(run.parts, run.log, title=headings[1])
         figures[f"convergence_{name}"] = run_plots.convergence(run.parts, run.log, f"Convergence: {title}")
-    figures["remark_2_observers"] = _observers(reproduction.observers)
+    figures["remark_2_observers"] = _plot_observers(reproduction.observers)
     return figures
 
 
 @style.styled
-def _observers(measured: list[remark_2.Measured]) -> Figure:
+def _plot_observers(measured: list[remark_2.Measured]) -> Figure:
     """Plot each observer's estimation error, and the chattering under both signs (Remark 2)."""
     runs = {(run.observer, run.sign): run for run in measured}
     kinds = list(dict.fromkeys(run.observer for run in measured))
@@ -109,8 +109,8 @@ def _observers(measured: list[remark_2.Measured]) -> Figure:
     for k, sign in enumerate(dict.fromkeys(run.sign for run in measured)):
         heights = [runs[kind, sign].chattering for kind in kinds]
         colour, hatch = style.STYLES[k][0], ("", "//")[k % 2]
-        at = np.arange(len(kinds)) + 0.38 * (k - 0.5)
-        bars = right.bar(at, heights, 0.36, color=colour, hatch=hatch, ec="white", label=f"{sign} sign")
+        positions = np.arange(len(kinds)) + 0.38 * (k - 0.5)
+        bars = right.bar(positions, heights, 0.36, color=colour, hatch=hatch, ec="white", label=f"{sign} sign")
         right.bar_label(bars, fmt="%.0e", fontsize=8)
     right.set_yscale("log")
     right.set_axisbelow(True)
@@ -128,20 +128,20 @@ def _markdown(reproduction: Reproduction) -> str:
         [
             "# The paper's claims beside what was measured",
             "",
-            *_rows(("where", "the paper", "measured", "verdict", "why"), claims),
+            *_markdown_table(("where", "the paper", "measured", "verdict", "why"), claims),
             "",
             "# Its slips, and what shows them",
             "",
-            *_rows(("where", "the paper", "what it must be", "shown by"), shown),
+            *_markdown_table(("where", "the paper", "what it must be", "shown by"), shown),
             "",
             "# Remark 2: observers and signs, sampled at 20 Hz, t_f = 35 s, delta = 0.5 s, no noise",
             "",
-            *_rows(*remark_2.rows(reproduction.observers)),
+            *_markdown_table(*remark_2.rows(reproduction.observers)),
             "",
         ]
     )
 
 
-def _rows(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> list[str]:
+def _markdown_table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> list[str]:
     cells = [header, tuple("---" for _ in header), *rows]
     return ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in cells]

@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # runs without C code do not need this import
     from ptsmc_jax.onboard.library import InTheLoop
 
 # fields of a verdict on a requirement that allows violations for some of the time
-OF_TIME = ("quantile", "confidence", "interpretation", "fraction_of_time", "shown")
+TIME_FRACTION_FIELDS = ("quantile", "confidence", "interpretation", "fraction_of_time", "shown")
 
 
 def summary(run: Run, scenario: Scenario, computer: "InTheLoop | None" = None) -> dict[str, Any]:
@@ -35,19 +35,19 @@ def summary(run: Run, scenario: Scenario, computer: "InTheLoop | None" = None) -
     verdicts = {
         v.metric: {
             **{"limit": v.limit, "margin": v.margin, "met": v.met, "worst": v.worst, "at_least": v.at_least},
-            **({} if v.fraction_of_time is None else {name: getattr(v, name) for name in OF_TIME}),
+            **({} if v.fraction_of_time is None else {name: getattr(v, name) for name in TIME_FRACTION_FIELDS}),
         }
         for v in run.verdicts
     }
     heading = {"status": run.status, "reason": run.reason, "bad_time": run.bad_time}
     lower_bound = None if run.lower_bound is None else run.lower_bound.window_error
-    warnings, decided_by = plausibility.warnings(scenario), {}
+    warnings, controller_entries = plausibility.warnings(scenario), {}
     if computer is not None:
         warnings += [computer.parameter_differences] if computer.parameter_differences else []
         statuses = {name: count for name, count in run.samples.items() if count}
-        decided_by = {"controller_statuses": statuses, "controller": computer.library.checksum}
-    judged = {"lower_bound": lower_bound, "verdicts": verdicts, "warnings": warnings}
-    return {**heading, **run.metrics, **judged, **decided_by}
+        controller_entries = {"controller_statuses": statuses, "controller": computer.library.checksum}
+    assessment = {"lower_bound": lower_bound, "verdicts": verdicts, "warnings": warnings}
+    return {**heading, **run.metrics, **assessment, **controller_entries}
 
 
 def write(
@@ -76,17 +76,17 @@ def write(
     """
     made_by = {"command": "simulate", "seed": seed, "trial": trial, **replayed, **custom.checksums(scenario)}
     if computer is not None:
-        place = computer.library.folder
+        c_folder = computer.library.folder
         made_by |= {
-            "controller": str(place.absolute()),
-            custom.checksum_name(custom.CONTROLLER): sources.checksum(place),
+            "controller": str(c_folder.absolute()),
+            custom.checksum_name(custom.CONTROLLER_OPTION): sources.checksum(c_folder),
         }
-    store.record(folder, parsing.dump(scenario), made_by, summary(run, scenario, computer))
+    store.write_run_files(folder, parsing.dump(scenario), made_by, summary(run, scenario, computer))
     columns = run.columns()
     store.write_csv(folder / "trajectory.csv", list(columns), np.column_stack(list(columns.values())).tolist())
     if aem:
         x, t = run.log.x, np.asarray(run.log.t)
-        text = attitude_messages.write("SPACECRAFT", t, np.asarray(x.q), np.asarray(x.w), scenario.loop.epoch)
+        text = attitude_messages.format_message("SPACECRAFT", t, np.asarray(x.q), np.asarray(x.w), scenario.loop.epoch)
         store.write_text(folder / "attitude.aem", text)
     if figures:
         from ptsmc_jax.figures import run_plots, style  # the import takes 0.3 s, which only figures need

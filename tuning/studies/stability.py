@@ -1,6 +1,7 @@
 """`ptsmc margins`: gain, phase and delay margins and the peak sensitivity of a scenario's loop.
 
-The loop is linearised along the nominal run: at samples of the approach phase and in the hold phase. Read `find` first.
+The loop is linearised along the nominal run: at samples of the approach phase and in the hold phase. Read
+`find_margins` first.
 """
 
 from pathlib import Path
@@ -17,13 +18,13 @@ from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.catalogues import CATALOGUES, NO_SIGN
 from ptsmc_jax.theory import margins, run_margins
-from ptsmc_jax.theory.crossings import MOST
+from ptsmc_jax.theory.crossings import LARGEST_MARGIN
 from ptsmc_jax.theory.limit_cycles import LimitCycle
 from ptsmc_jax.theory.margins import FIELDS
 from ptsmc_jax.theory.run_margins import Course
 
 
-def find(scenario: Scenario) -> tuple[Study, Course]:
+def find_margins(scenario: Scenario) -> tuple[Study, Course]:
     """Return the margins of a scenario along its nominal run.
 
     Raises ScenarioError if the loop is continuous, if it has no finite derivatives in the hold phase, or if the nominal
@@ -32,15 +33,15 @@ def find(scenario: Scenario) -> tuple[Study, Course]:
     if not scenario.sampled:
         raise ScenarioError(f'margins need the sampled loop, but loop.mode is "{scenario.loop.mode}"')
     ready = study(scenario)
-    course = run_margins.along(ready.parts)
+    course = run_margins.margins_along_run(ready.parts)
     without_derivatives, code = np.isnan(course.hold[1].peak_sensitivity).any(), rollout.OK
     if course.singularity_distance < rollout.SINGULAR_DISTANCE:
         code = rollout.SINGULAR
     elif without_derivatives:
         code = int(rollout.simulate_parts(ready.parts, np.uint32(0), np.uint32(0)).status)
     if code not in rollout.FINISHED:
-        status, why = rollout.STATUS[code]
-        raise ScenarioError(f"margins need a nominal run that reaches its end, but it ends {status}: {why}")
+        status, reason = rollout.STATUS[code]
+        raise ScenarioError(f"margins need a nominal run that reaches its end, but it ends {status}: {reason}")
     if without_derivatives:
         raise ScenarioError(
             f"margins need finite derivatives of the loop by all of its states, but with controller.kind = "
@@ -49,7 +50,7 @@ def find(scenario: Scenario) -> tuple[Study, Course]:
     return ready, course
 
 
-def worst(ready: Study) -> dict[str, dict[str, Any]] | None:
+def worst_margins(ready: Study) -> dict[str, dict[str, Any]] | None:
     """Return the margins of the worst axis "before" the hand-over, at the samples that are judged, and in "hold".
 
     Returns:
@@ -60,30 +61,30 @@ def worst(ready: Study) -> dict[str, dict[str, Any]] | None:
     """
     if not ready.scenario.sampled:
         return None
-    left, hold, limit_cycle = run_margins.judged(ready.parts)
-    if np.isnan(left.peak_sensitivity[-1]).any():
+    sample_margins, hold, limit_cycle = run_margins.judge_run(ready.parts)
+    if np.isnan(sample_margins.peak_sensitivity[-1]).any():
         return None
-    each = {}
-    for where, rows in (("before", ~hold), ("hold", hold)):
-        if rows.any():
-            there = jax.tree.map(lambda v, rows=rows: v[rows], left)
-            least = {name: _number(value) for name, value in there.worst().items()}
-            each[where] = {"stable": bool(there.stable.all()), **least}
+    phases = {}
+    for phase, mask in (("before", ~hold), ("hold", hold)):
+        if mask.any():
+            phase_margins = jax.tree.map(lambda v, mask=mask: v[mask], sample_margins)
+            smallest = {name: _finite_or_none(value) for name, value in phase_margins.worst().items()}
+            phases[phase] = {"stable": bool(phase_margins.stable.all()), **smallest}
     if limit_cycle is not None:
-        each["hold"] |= _limit_cycle(ready.scenario, limit_cycle)
-    return each
+        phases["hold"] |= _limit_cycle_entry(ready.scenario, limit_cycle)
+    return phases
 
 
-def _limit_cycle(scenario: Scenario, limit_cycle: LimitCycle) -> dict[str, Any]:
+def _limit_cycle_entry(scenario: Scenario, limit_cycle: LimitCycle) -> dict[str, Any]:
     unit = CATALOGUES[scenario.plant.kind]["peak_torque"].unit
     return {"limit_cycle": {**limit_cycle._asdict(), "unit": unit}}
 
 
-def _number(value: Any) -> float | None:
+def _finite_or_none(value: Any) -> float | None:
     return float(value) + 0.0 if np.isfinite(value) else None  # + 0.0 replaces -0 by 0
 
 
-def names(ready: Study) -> tuple[list[str], list[str]]:
+def signal_names(ready: Study) -> tuple[list[str], list[str]]:
     """Return the names of the inputs and the names of the measured signals."""
     plant = ready.parts.plant
     return plant.input_labels, plant.signal_labels(plant.visible(ready.parts.initial))
@@ -91,60 +92,63 @@ def names(ready: Study) -> tuple[list[str], list[str]]:
 
 def summary(ready: Study, course: Course) -> dict[str, Any]:
     """Return the content of `summary.json`: margins in [dB], [deg] and [s]; null: infinite, or no value."""
-    inputs, seen = names(ready)
+    inputs, signals = signal_names(ready)
     (_, hold), before = course.hold, course.before_hand_over
 
-    def table(left: margins.Margins, labels: list[str], fields: tuple[str, ...]) -> dict[str, Any]:
-        return {label: {name: _number(getattr(left, name)[k]) for name in fields} for k, label in enumerate(labels)}
+    def table(loop_margins: margins.Margins, labels: list[str], fields: tuple[str, ...]) -> dict[str, Any]:
+        return {
+            label: {name: _finite_or_none(getattr(loop_margins, name)[k]) for name in fields}
+            for k, label in enumerate(labels)
+        }
 
-    def opened(k: int) -> dict[str, list[str]]:
-        left, new = jax.tree.map(lambda v: v[k], (course.at_input, course.loops.new))
-        none_back = _open(left)
-        cut = none_back & ~np.any(new[0], axis=0)  # the command has no effect on the plant
-        return {key: [name for name, it in zip(inputs, rows, strict=True) if it]
-                for key, rows in (("open", none_back), ("cut", cut))}  # fmt: skip
+    def open_inputs(k: int) -> dict[str, list[str]]:
+        loop_margins, new = jax.tree.map(lambda v: v[k], (course.at_input, course.loops.new))
+        is_open = _is_open(loop_margins)
+        has_no_effect = is_open & ~np.any(new[0], axis=0)  # the command has no effect on the plant
+        return {key: [name for name, selected in zip(inputs, masks, strict=True) if selected]
+                for key, masks in (("open", is_open), ("cut", has_no_effect))}  # fmt: skip
 
     t_f = float(ready.parts.controller.t_f)
     return {
         "stable": bool(hold.stable.all()),
-        **opened(-1),
-        "worst": {name: _number(v) for name, v in course.worst().items()},
+        **open_inputs(-1),
+        "worst": {name: _finite_or_none(v) for name, v in course.worst().items()},
         "hold": table(hold, inputs, (*FIELDS, "crossover")),
-        "together": {name: _number(course.together[name]) for name in FIELDS},
-        "sensors": table(course.at_sensors, seen, tuple(name for name in FIELDS if name != "delay")),
+        "together": {name: _finite_or_none(course.together[name]) for name in FIELDS},
+        "sensors": table(course.at_sensors, signals, tuple(name for name in FIELDS if name != "delay")),
         "before": [
             {
                 "time_to_go": t_f - float(t),
                 "judged": bool(counts),
                 "stable": bool(before.stable[k].all()),
                 **{
-                    name: _number((max if name == "peak_sensitivity" else min)(getattr(before, name)[k]))
+                    name: _finite_or_none((max if name == "peak_sensitivity" else min)(getattr(before, name)[k]))
                     for name in FIELDS
                 },
-                **opened(k),
+                **open_inputs(k),
             }
             for k, (t, counts) in enumerate(zip(course.t[:-1], course.judged, strict=False))
         ],
         **({"not_converged": True} if course.not_converged else {}),
-        **({"dispersed": margin_verdicts.TRIALS} if margin_verdicts.differ(ready.dispersion) else {}),
-        "note": NO_SIGN if ready.scenario.exact_sign else None,
-        **_start(ready),
-        **({} if course.limit_cycle is None else _limit_cycle(ready.scenario, course.limit_cycle)),
+        **({"dispersed": margin_verdicts.TRIALS} if margin_verdicts.has_different_loops(ready.dispersion) else {}),
+        "note": NO_SIGN if ready.scenario.has_discontinuous_sign else None,
+        **_initial_angle_entry(ready),
+        **({} if course.limit_cycle is None else _limit_cycle_entry(ready.scenario, course.limit_cycle)),
     }
 
 
-def _open(left: margins.Margins) -> np.ndarray:
-    """Return at which inputs the loop transfer L is zero, (m,).
+def _is_open(loop_margins: margins.Margins) -> np.ndarray:
+    """Return whether the loop transfer L is zero at each input, (m,).
 
     For example, a torque limit saturates the command of the nominal run, or the law does not react to the state at this
     sample.
     """
     # infinite margins, or the largest reported distance from a stability limit if other axes make the loop unstable
-    unlimited = (np.abs(left.gain_up) >= MOST) & (np.abs(left.gain_down) >= MOST)
-    return unlimited & (np.abs(left.peak_sensitivity) < 1e-9) & np.isnan(left.crossover)
+    unlimited = (np.abs(loop_margins.gain_up) >= LARGEST_MARGIN) & (np.abs(loop_margins.gain_down) >= LARGEST_MARGIN)
+    return unlimited & (np.abs(loop_margins.peak_sensitivity) < 1e-9) & np.isnan(loop_margins.crossover)
 
 
-def _start(ready: Study) -> dict[str, float]:
+def _initial_angle_entry(ready: Study) -> dict[str, float]:
     """Return {"start_deg": initial angle to the reference in the nominal run [deg]}, or {} for other plants."""
     parts, kinematics = ready.parts, ready.parts.controller.kinematics
     if kinematics.angle_unit != "rad":
@@ -163,8 +167,8 @@ def write(folder: Path, ready: Study, course: Course, figures: bool) -> None:
     """
     scenario = ready.scenario
     made_by = {"command": "margins", "seed": None, **custom.checksums(scenario)}
-    store.record(folder, parsing.dump(scenario), made_by, summary(ready, course))
-    inputs, _ = names(ready)
+    store.write_run_files(folder, parsing.dump(scenario), made_by, summary(ready, course))
+    inputs, _ = signal_names(ready)
     t_f = float(ready.parts.controller.t_f)
     rows = [
         [t, t_f - t, name, *(float(getattr(course.at_input, field)[j, k]) for field in (*FIELDS, "crossover")),
@@ -184,13 +188,13 @@ def figures_of(ready: Study, course: Course) -> dict[str, Any]:
     """Return the figures of the margins by name."""
     from ptsmc_jax.figures import margin_plots  # slow import, not needed without figures
 
-    inputs, _ = names(ready)
+    inputs, _ = signal_names(ready)
     loop, hold = course.hold
-    w, seen = margins.responses(loop)
+    w, responses = margins.responses(loop)
     return {
-        "nichols": margin_plots.nichols(seen, inputs),
-        "sensitivity": margin_plots.sensitivity(w, seen, inputs),
-        "margins": margin_plots.over_time(
+        "nichols": margin_plots.nichols(responses, inputs),
+        "sensitivity": margin_plots.sensitivity(w, responses, inputs),
+        "margins": margin_plots.margins_over_time(
             float(ready.parts.controller.t_f) - course.t[:-1], course.before_hand_over, hold
         ),
     }

@@ -19,18 +19,18 @@ from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation.catalogues import MARGINS
 from tuning.search import gains
-from tuning.search.objective import T_F, Problem, replaced
+from tuning.search.objective import T_F, Problem, replace_entries
 from tuning.search.optimise import Search
 from tuning.search.progress import Report, headed
 from tuning.search.rounds import MARGIN
 from tuning.studies import judging
-from tuning.studies.posing import Posed
+from tuning.studies.posing import TuningSetup
 
 TORQUE, SENSITIVITY = "peak_torque", "peak_sensitivity"
 POINTS = 20  # default number of limits on the peak torque
 INACTIVE_LIMIT = 1e9  # limit on the peak torque that is never active
 SMALLEST_LIMIT = 0.05  # fraction of the largest useful peak torque; hardly any gains keep such a limit
-TIGHTER = 3  # largest number of searches for the least peak torque
+MOST_SEARCHES = 3  # largest number of searches for the least peak torque
 FEWER_STARTS = 4  # number of starting points of a search whose gains are refined later
 LIMITS = (3.0, 4.0, 5.0, 6.0, 8.0, 12.0)  # default limits on the peak sensitivity [dB]
 BOUNDED = ("gain_margin", "phase_margin", SENSITIVITY)  # margins that a limit on the peak sensitivity bounds
@@ -56,8 +56,9 @@ class Trade(ABC):
 
     against: ClassVar[str]  # value of the option --against
     purpose: ClassVar[str]  # end of error messages, such as "for a front against t_f"
-    merged: ClassVar[bool] = True  # whether values with the same gains share a point
-    compared: ClassVar[bool] = False  # whether to mark dominated points and the knee, and to judge the published gains
+    merges_points: ClassVar[bool] = True  # whether values with the same gains share a point
+    # whether to mark dominated points and the knee, and to judge the published gains
+    compares_points: ClassVar[bool] = False
 
     def check(self) -> None:
         """Raise ScenarioError if the study does not apply to the scenario."""
@@ -73,23 +74,23 @@ class Trade(ABC):
         return self.scenario
 
     @property
-    def farther(self) -> dict[str, float]:
+    def reach_overrides(self) -> dict[str, float]:
         """Return the fields of `Reach` that the targets need beyond the bounds of the free gains."""
         return {}
 
     @abstractmethod
-    def targets(self, posed: Posed, tell: Report) -> tuple[list[Target], list[np.ndarray]]:
+    def targets(self, setup: TuningSetup, report: Report) -> tuple[list[Target], list[np.ndarray]]:
         """Search from the scenario's gains, without known gains. Raises KeyboardInterrupt on Ctrl-C.
 
         Args:
-            posed: the tuning problem of `base`.
-            tell: called with the progress.
+            setup: the tuning problem of `base`.
+            report: called with the progress.
 
         Returns:
             The targets, and the gains that these searches found, (gains,) each, as fractions of the bounds' intervals.
         """
 
-    def tuned(self, value: float, found: dict[str, float]) -> Scenario:
+    def tuned_scenario(self, value: float, found: dict[str, float]) -> Scenario:
         """Return the scenario with the gains found for a value of the traded quantity."""
         return gains.in_scenario(self.scenario, found)
 
@@ -124,7 +125,7 @@ class Torque(Trade):
 
     against = "torque"
     purpose = "for a front of the window error"
-    compared = True
+    compares_points = True
 
     def check(self) -> None:
         """Raise ScenarioError if the study does not apply to the scenario."""
@@ -137,39 +138,44 @@ class Torque(Trade):
     def base(self) -> Scenario:
         """Return the scenario with a requirement on the peak torque."""
         limited = tables.limit_of(self.scenario, TORQUE) is not None
-        return self.scenario if limited else _requiring(self.scenario, {TORQUE: INACTIVE_LIMIT})
+        return self.scenario if limited else _with_requirements(self.scenario, {TORQUE: INACTIVE_LIMIT})
 
-    def targets(self, posed: Posed, tell: Report) -> tuple[list[Target], list[np.ndarray]]:
+    def targets(self, setup: TuningSetup, report: Report) -> tuple[list[Target], list[np.ndarray]]:
         """Search without a limit, for the least torque, and for a limit between both; see `Trade.targets`."""
-        at = posed.problem.metrics.index(TORQUE)
+        index = setup.problem.metrics.index(TORQUE)
 
-        def under(limit: float, joined: Problem = posed.problem) -> Problem:
-            return replace(joined, limits=replaced(posed.problem.limits, at, limit))
+        def limited_problem(limit: float, base: Problem = setup.problem) -> Problem:
+            return replace(base, limits=replace_entries(setup.problem.limits, index, limit))
 
-        loose = [replace(one, limit=INACTIVE_LIMIT) if one.metric == TORQUE else one for one in posed.asked]
-        free = _found(posed, under(INACTIVE_LIMIT), headed(tell, "most torque"), asked=loose)
-        highest = free.ended[at] * INACTIVE_LIMIT
+        loose = [replace(r, limit=INACTIVE_LIMIT) if r.metric == TORQUE else r for r in setup.constraints]
+        unlimited = _search(setup, limited_problem(INACTIVE_LIMIT), headed(report, "most torque"), constraints=loose)
+        highest = unlimited.worst_completed[index] * INACTIVE_LIMIT
 
         def search(limit: float) -> tuple[Search, float]:
-            report = headed(tell, "least torque")
-            found = _found(posed, under(limit, free.problem), report, FEWER_STARTS, asked=())
-            return found, found.ended[at] * limit
+            search_report = headed(report, "least torque")
+            outcome = _search(
+                setup, limited_problem(limit, unlimited.problem), search_report, FEWER_STARTS, constraints=()
+            )
+            return outcome, outcome.worst_completed[index] * limit
 
         least, lowest = least_torque(search, highest)
         scenario_limit = tables.limit_of(self.scenario, TORQUE)
-        limits, middle = limits_between(lowest / (1.0 - MARGIN), highest / (1.0 - MARGIN), self.points, scenario_limit)
-        targets = [Target(float(one), f"peak torque {one:.3g}", under(one, free.problem)) for one in limits]
+        limits, k = limits_between(lowest / (1.0 - MARGIN), highest / (1.0 - MARGIN), self.points, scenario_limit)
+        targets = [
+            Target(float(limit), f"peak torque {limit:.3g}", limited_problem(limit, unlimited.problem))
+            for limit in limits
+        ]
         # the best local minimum between the ends may differ from those at the ends
-        between = _found(posed, targets[middle].problem, headed(tell, targets[middle].name), asked=())
+        middle = _search(setup, targets[k].problem, headed(report, targets[k].name), constraints=())
         return targets, [
-            normalised for found in (free, least, between) for normalised in (found.normalised, *found.ends)
+            normalised for outcome in (unlimited, least, middle) for normalised in (outcome.normalised, *outcome.ends)
         ]
 
     def costs(self, tuned: Scenario, trials: Trials, seed: int) -> dict[str, float]:
         """Return the largest and the mean peak torque [N m]."""
         peaks = np.asarray(trials.metrics.peak_torque)[trials.finished]
         mean = float(np.mean(peaks)) if peaks.size else np.nan
-        return {TORQUE: judging.largest(TORQUE, tuned, trials), "mean_peak_torque": mean}
+        return {TORQUE: judging.required_quantile(TORQUE, tuned, trials), "mean_peak_torque": mean}
 
     def options(self) -> dict[str, Any]:
         """Return the option --points."""
@@ -200,36 +206,37 @@ class Margins(Trade):
     def values(self) -> list[float]:
         """Return the limits, loosest first [dB]; infinite: no limit."""
         scenario_limit = tables.limit_of(self.scenario, SENSITIVITY)
-        usual = {*LIMITS, *([] if scenario_limit is None else [scenario_limit])}
-        return [np.inf, *sorted(self.limits or usual, reverse=True)]
+        defaults = {*LIMITS, *([] if scenario_limit is None else [scenario_limit])}
+        return [np.inf, *sorted(self.limits or defaults, reverse=True)]
 
     @cached_property
     def base(self) -> Scenario:
-        """Return the scenario that requires the tightest limit on M_s, in place of the margins in `BOUNDED`."""
-        return _requiring(self.scenario, {SENSITIVITY: self.values[-1]}, without=BOUNDED)
+        """Return the scenario that requires the tightest limit on M_s, instead of the margins in `BOUNDED`."""
+        return _with_requirements(self.scenario, {SENSITIVITY: self.values[-1]}, without=BOUNDED)
 
-    def targets(self, posed: Posed, tell: Report) -> tuple[list[Target], list[np.ndarray]]:
+    def targets(self, setup: TuningSetup, report: Report) -> tuple[list[Target], list[np.ndarray]]:
         """Search for the best gains under each limit; see `Trade.targets`."""
-        asked = posed.problem.margins
-        assert asked is not None
-        at, targets, known = asked.metrics.index(SENSITIVITY), [], []
+        required_margins = setup.problem.margins
+        assert required_margins is not None
+        index, targets, known = required_margins.metrics.index(SENSITIVITY), [], []
         for value in self.values:
             name = f"|S| at most {value:g} dB" if value < np.inf else "no limit on |S|"
-            limited = replace(posed.problem, margins=replace(asked, required=replaced(asked.required, at, value)))
-            found = _found(posed, limited, headed(tell, name), FEWER_STARTS if targets else None)
-            targets.append(Target(value, name, found.problem))
-            known.append(found.normalised)
+            limits = replace(required_margins, required=replace_entries(required_margins.required, index, value))
+            limited = replace(setup.problem, margins=limits)
+            outcome = _search(setup, limited, headed(report, name), FEWER_STARTS if targets else None)
+            targets.append(Target(value, name, outcome.problem))
+            known.append(outcome.normalised)
         return targets, known
 
     def costs(self, tuned: Scenario, trials: Trials, seed: int) -> dict[str, float]:
         """Return the largest peak torque [N m], and the worst margins of the held-out trials' loops."""
-        asked = scenarios.replace(tuned, requirements=dict.fromkeys(MARGINS, 1.0))
-        verdicts = margin_verdicts.of_trials(study(judging.on_flight_clock(asked)), seed)
-        return {TORQUE: judging.largest(TORQUE, tuned, trials)} | {one.metric: one.worst for one in verdicts}
+        with_margins = scenarios.replace(tuned, requirements=dict.fromkeys(MARGINS, 1.0))
+        verdicts = margin_verdicts.judge_trials(study(judging.on_flight_clock(with_margins)), seed)
+        return {TORQUE: judging.required_quantile(TORQUE, tuned, trials)} | {v.metric: v.worst for v in verdicts}
 
     def options(self) -> dict[str, Any]:
         """Return the options --against and --limits."""
-        return {"against": self.against, "limits": _listed(self.values[1:])}
+        return {"against": self.against, "limits": _join_values(self.values[1:])}
 
 
 @dataclass(frozen=True)
@@ -240,7 +247,7 @@ class SlewTime(Trade):
 
     against = "t_f"
     purpose = "for a front against t_f"
-    merged = False
+    merges_points = False
 
     def check(self) -> None:
         """Raise ScenarioError if the study does not apply to the scenario, or a time cannot be simulated."""
@@ -250,89 +257,89 @@ class SlewTime(Trade):
         super().check()
         if T_F in scenario.search.gains:
             raise wrong("tune.free", list(scenario.search.gains), f"without t_f {self.purpose}")
-        if free_gains.observer_follows(scenario):
+        if free_gains.is_observer_time_default(scenario):
             raise ScenarioError(f"observer.t_o is absent, but must be set {self.purpose}; its default depends on t_f")
         for key in scenario.requirements:
             if key in MARGINS:
                 raise ScenarioError(f"requirements.{key} must be absent {self.purpose}, which does not compute margins")
         for t_f in self.values:
-            self._at(t_f)
+            self._with_t_f(t_f)
 
     @cached_property
     def values(self) -> list[float]:
         """Return the prescribed times in ascending order [s]."""
-        usual = (float(f"{part * self.scenario.controller.t_f:.3g}") for part in SPAN)
-        return sorted(self.times or usual)
+        defaults = (float(f"{fraction * self.scenario.controller.t_f:.3g}") for fraction in SPAN)
+        return sorted(self.times or defaults)
 
     @cached_property
     def base(self) -> Scenario:
         """Return the scenario with the shortest time."""
-        return self._at(self.values[0])
+        return self._with_t_f(self.values[0])
 
     @property
-    def farther(self) -> dict[str, float]:
+    def reach_overrides(self) -> dict[str, float]:
         """Return the longest time as t_f [s]."""
         return {"t_f": self.values[-1]}
 
-    def _at(self, t_f: float) -> Scenario:
+    def _with_t_f(self, t_f: float) -> Scenario:
         """Return the scenario with this prescribed time [s], and default bounds of delta that follow it."""
         tune = self.scenario.search
         bounds = {name: both for name, both in tune.bounds.items() if name != "delta"}
-        if tune.bounds.get("delta") not in (None, free_gains.by_default(self.scenario, "delta")):
+        if tune.bounds.get("delta") not in (None, free_gains.default_bounds(self.scenario, "delta")):
             bounds["delta"] = tune.bounds["delta"]
         timed = gains.in_scenario(scenarios.replace(self.scenario, tune=None), {"t_f": t_f})
-        return scenarios.replace(timed, tune={**parsing.plain(tune), "bounds": bounds})
+        return scenarios.replace(timed, tune={**parsing.to_dict(tune), "bounds": bounds})
 
-    def targets(self, posed: Posed, tell: Report) -> tuple[list[Target], list[np.ndarray]]:
+    def targets(self, setup: TuningSetup, report: Report) -> tuple[list[Target], list[np.ndarray]]:
         """Search for the best gains at the longest time, the shortest, and the others; see `Trade.targets`.
 
         Hard trials that the first two searches add to the training trials are used for all other times, too.
         """
-        joined, last, known = posed.problem, len(self.values) - 1, []
-        parts = [gains.with_gains(joined.parts, {"t_f": t_f}) for t_f in self.values]
+        problem, last, known = setup.problem, len(self.values) - 1, []
+        parts = [gains.with_gains(problem.parts, {"t_f": t_f}) for t_f in self.values]
         for k in (last, 0, *range(last - 1, 0, -1)):
             name = {last: "longest time", 0: "shortest time"}.get(k, f"{self.values[k]:g} s")
-            starts, asked = None if k == last else FEWER_STARTS, None if k in (0, last) else ()
-            found = _found(posed, replace(joined, parts=parts[k]), headed(tell, name), starts, asked)
-            known.append(found.normalised)
-            joined = found.problem if k in (0, last) else joined
-        problems = [replace(joined, parts=one) for one in parts]
-        targets = [Target(t_f, f"{t_f:g} s", one) for t_f, one in zip(self.values, problems, strict=True)]
+            starts, constraints = None if k == last else FEWER_STARTS, None if k in (0, last) else ()
+            outcome = _search(setup, replace(problem, parts=parts[k]), headed(report, name), starts, constraints)
+            known.append(outcome.normalised)
+            problem = outcome.problem if k in (0, last) else problem
+        problems = [replace(problem, parts=variant) for variant in parts]
+        targets = [Target(t_f, f"{t_f:g} s", variant) for t_f, variant in zip(self.values, problems, strict=True)]
         return targets, known
 
-    def tuned(self, value: float, found: dict[str, float]) -> Scenario:
+    def tuned_scenario(self, value: float, found: dict[str, float]) -> Scenario:
         """Return the scenario with this prescribed time [s] and these gains."""
-        return gains.in_scenario(self._at(value), found)
+        return gains.in_scenario(self._with_t_f(value), found)
 
     def costs(self, tuned: Scenario, trials: Trials, seed: int) -> dict[str, float]:
-        """Return `judging.largest` of the metrics in `SLEW_COSTS` that runs of the scenario have."""
+        """Return `judging.required_quantile` of the metrics in `SLEW_COSTS` that runs of the scenario have."""
         needed = {name: tuned.metrics[name].table for name in SLEW_COSTS if name in tuned.metrics}
         has = [name for name, table in needed.items() if table is None or getattr(tuned, table, None) is not None]
-        return {name: judging.largest(name, tuned, trials) for name in has}
+        return {name: judging.required_quantile(name, tuned, trials) for name in has}
 
     def options(self) -> dict[str, Any]:
         """Return the options --against and --times."""
-        return {"against": self.against, "times": _listed(self.values)}
+        return {"against": self.against, "times": _join_values(self.values)}
 
 
-def build(against: str, scenario: Scenario, points: int | None, listed: tuple[float, ...]) -> Trade:
+def build(against: str, scenario: Scenario, points: int | None, values: tuple[float, ...]) -> Trade:
     """Return the trade that the options of `ptsmc pareto` ask for.
 
     Args:
         against: "torque", "margins" or "t_f".
-        scenario: with free gains.
+        scenario: a scenario with free gains.
         points: number of limits on the torque; None: `POINTS`.
-        listed: prescribed times [s], or limits on the peak sensitivity [dB]; empty: the defaults.
+        values: prescribed times [s], or limits on the peak sensitivity [dB]; empty: the defaults.
 
     Raises:
         ScenarioError: the study does not apply to the scenario, or a time cannot be simulated.
     """
-    each: tuple[Trade, ...] = (
+    choices: tuple[Trade, ...] = (
         Torque(scenario, points or POINTS),
-        Margins(scenario, listed),
-        SlewTime(scenario, listed),
+        Margins(scenario, values),
+        SlewTime(scenario, values),
     )
-    trade = next(one for one in each if one.against == against)
+    trade = next(choice for choice in choices if choice.against == against)
     trade.check()
     return trade
 
@@ -357,7 +364,7 @@ def limits_between(lowest: float, highest: float, points: int, scenario_limit: f
 
 
 def least_torque(
-    search: Callable[[float], tuple[Any, float]], highest: float, tighter: int = TIGHTER
+    search: Callable[[float], tuple[Any, float]], highest: float, searches: int = MOST_SEARCHES
 ) -> tuple[Any, float]:
     """Search for the gains that need the least peak torque.
 
@@ -366,41 +373,45 @@ def least_torque(
     Args:
         search: returns the outcome for a limit [N m], and its peak torque [N m].
         highest: the largest peak torque that improves the accuracy [N m].
-        tighter: largest number of limits.
+        searches: largest number of searches, each with a lower limit.
 
     Returns:
         The last outcome, and its peak torque [N m].
     """
     limit = SMALLEST_LIMIT * highest
-    found, peak = search(limit)
-    return (found, peak) if peak > limit or tighter == 1 else least_torque(search, limit, tighter - 1)
+    outcome, peak = search(limit)
+    return (outcome, peak) if peak > limit or searches == 1 else least_torque(search, limit, searches - 1)
 
 
-def _found(
-    posed: Posed, problem: Problem, report: Report, starts: int | None = None, asked: Sequence[Any] | None = None
+def _search(
+    setup: TuningSetup,
+    problem: Problem,
+    report: Report,
+    starts: int | None = None,
+    constraints: Sequence[Any] | None = None,
 ) -> Search:
     """Search from the scenario's gains. Raises KeyboardInterrupt if the search was interrupted.
 
     Args:
-        posed: the tuning problem of the scenario.
+        setup: the tuning problem of the scenario.
         problem: the problem with a limit, or another value of the traded quantity.
         report: called with the progress.
         starts: number of starting points; None: as in the scenario.
-        asked: requirements that the search keeps; None: those of the scenario.
+        constraints: requirements that the search keeps; None: those of the scenario.
     """
-    starts = posed.ready.scenario.search.starts if starts is None else starts
-    found = posed.search(problem, posed.scenario_gains, starts, asked, judged=False, report=report)
-    if found.interrupted:
+    starts = setup.ready.scenario.search.starts if starts is None else starts
+    outcome = setup.search(problem, setup.scenario_gains, starts, constraints, judged=False, report=report)
+    if outcome.interrupted:
         raise KeyboardInterrupt
-    return found
+    return outcome
 
 
-def _requiring(scenario: Scenario, limits: dict[str, float], without: Sequence[str] = ()) -> Scenario:
+def _with_requirements(scenario: Scenario, limits: dict[str, float], without: Sequence[str] = ()) -> Scenario:
     """Return the scenario with further requirements, and without some of its own."""
     stated = parsing.dump(scenario).get("requirements", {})
-    kept = {name: one for name, one in stated.items() if name not in without}
+    kept = {name: limit for name, limit in stated.items() if name not in without}
     return scenarios.replace(scenario, requirements={**kept, **limits})
 
 
-def _listed(values: Sequence[float]) -> str:
+def _join_values(values: Sequence[float]) -> str:
     return ",".join(str(float(value)).removesuffix(".0") for value in values)

@@ -19,7 +19,7 @@ from tuning.search.local_searches import Step
 from tuning.studies import judging
 from tuning.studies.tuner import BeyondBound, Trust, Tuning
 
-JUDGED = {"window_error": "rms", "peak_torque": "mean", "effort": "mean"}  # statistics with an interval
+INTERVAL_STATISTICS = {"window_error": "rms", "peak_torque": "mean", "effort": "mean"}  # statistics with an interval
 
 
 def statistics(trials: Trials, kind: str) -> dict[str, Any]:
@@ -27,29 +27,29 @@ def statistics(trials: Trials, kind: str) -> dict[str, Any]:
 
     kind: kind of the plant, which defines the metrics.
     """
-    found: dict[str, Any] = {"trials": int(trials.status.size), "counts": trials.counts()}
+    results: dict[str, Any] = {"trials": int(trials.status.size), "counts": trials.counts()}
     for name, entry in catalogues.CATALOGUES[kind].items():
         values = getattr(trials.metrics, name)[trials.finished]
-        known = values[np.isfinite(values)]
-        if known.size == 0:
+        known_values = values[np.isfinite(values)]
+        if known_values.size == 0:
             if entry.table is None:  # the scenario must have the table that a metric needs
-                found[name] = None
+                results[name] = None
             continue
-        found[name] = {
-            "mean": known.mean(),
-            "rms": trust.rms(known),
-            "median": np.median(known),
-            "q99": np.quantile(known, 0.99),
-            "max": known.max(),
+        results[name] = {
+            "mean": known_values.mean(),
+            "rms": trust.rms(known_values),
+            "median": np.median(known_values),
+            "q99": np.quantile(known_values, 0.99),
+            "max": known_values.max(),
         }
         if name in catalogues.LARGER_IS_BETTER:  # report the smallest values, which are the worst
-            found[name] |= {"q01": np.quantile(known, 0.01), "min": known.min()}
-        if known.size < values.size:
-            found[name]["without_value"] = int(values.size - known.size)
-        if name in JUDGED:
-            statistic = JUDGED[name]
-            found[name][f"{statistic}_interval"] = trust.interval(known, getattr(trust, statistic))
-    return found
+            results[name] |= {"q01": np.quantile(known_values, 0.01), "min": known_values.min()}
+        if known_values.size < values.size:
+            results[name]["without_value"] = int(values.size - known_values.size)
+        if name in INTERVAL_STATISTICS:
+            statistic = INTERVAL_STATISTICS[name]
+            results[name][f"{statistic}_interval"] = trust.interval(known_values, getattr(trust, statistic))
+    return results
 
 
 def summary(tuning: Tuning) -> dict[str, Any]:
@@ -86,7 +86,7 @@ def summary(tuning: Tuning) -> dict[str, Any]:
         "shortest_t_f": None if tuning.shortest is None else asdict(tuning.shortest),
         "broken_by": tuning.broken_by,
         "verdicts": [verdict.in_summary() for verdict in tuning.verdicts],
-        "judged_on": judging.judged_on(tuning.tuned),
+        "judged_on": judging.describe_simulation(tuning.tuned),
         "warnings": plausibility.warnings(tuning.tuned),
         "search": {
             "objective": objective_name(tuning.tuned.search),
@@ -99,9 +99,9 @@ def summary(tuning: Tuning) -> dict[str, Any]:
             "earlier": [asdict(earlier) for earlier in tuning.earlier],
             "largest_over_limit": dict(zip(search.problem.rows, search.worst.tolist(), strict=True)),
             "conflict": search.conflict,
-            "searched_globally": search.globally,
+            "searched_globally": search.searched_globally,
             "confirmed": [
-                {**{k: v for k, v in asdict(one).items() if k != "harder"}, "confirmed": one.confirmed}
+                {**{k: v for k, v in asdict(one).items() if k != "surplus_violators"}, "confirmed": one.confirmed}
                 for one in search.counts
             ],
             "worst_case": tuning.tuned.search.worst_case,
@@ -112,7 +112,7 @@ def summary(tuning: Tuning) -> dict[str, Any]:
             "gradients": tuning.gradients,
             "seconds": tuning.seconds,
         },
-        "trust": None if tuning.trust is None else _trust(tuning.trust, tuning),
+        "trust": None if tuning.trust is None else _trust_entry(tuning.trust, tuning),
         "differential_evolution": None if tuning.check is None else asdict(tuning.check),
     }
 
@@ -122,12 +122,12 @@ def _accuracy_gain(held_out: Mapping[str, Trials]) -> dict[str, Any]:
 
     The ratio is over the trials that reach their end with both sets of gains.
     """
-    nothing = {"accuracy_gain_over_published": None, "accuracy_gain_interval": None}
+    no_gain = {"accuracy_gain_over_published": None, "accuracy_gain_interval": None}
     if "published" not in held_out:
-        return nothing
+        return no_gain
     both = held_out["tuned"].finished & held_out["published"].finished
     if not both.any():
-        return nothing
+        return no_gain
     published, tuned = (np.asarray(held_out[name].metrics.window_error)[both] for name in ("published", "tuned"))
     return {
         "accuracy_gain_over_published": trust.rms(published) / trust.rms(tuned),
@@ -135,50 +135,51 @@ def _accuracy_gain(held_out: Mapping[str, Trials]) -> dict[str, Any]:
     }
 
 
-def _trust(found: Trust, tuning: Tuning) -> dict[str, Any]:
+def _trust_entry(trust_results: Trust, tuning: Tuning) -> dict[str, Any]:
     """Return the entry "trust" of `summary.json`: gradient check, influence of each gain, sensitivities and margins."""
-    ideal = not tuning.tuned.sampled and tuning.tuned.hardware is None
+    is_ideal = not tuning.tuned.sampled and tuning.tuned.hardware is None
     influence = {}
-    for name, profile in found.profiles.items():
-        if not profile.seen:
+    for name, profile in trust_results.profiles.items():
+        if not profile.has_value:
             influence[name] = "unknown"
-        elif profile.flat:
+        elif profile.is_flat:
             influence[name] = "none"
         elif name not in tuning.at_bound:
             influence[name] = "optimum inside its bounds"
-        elif ideal and gain_names.base(name) in ("delta", "observer_gain"):
-            influence[name] = "no trade-off: without sampling and noise more of it only helps"
+        elif is_ideal and gain_names.base(name) in ("delta", "observer_gain"):
+            influence[name] = "no trade-off: without sampling and noise, values beyond its bound are only better"
         else:
             gain, side = gain_names.base(name), tuning.at_bound[name]
             bound = tuning.tuned.search.bounds[gain][side == "upper"]
             reason = free_gains.reason_of_bound(tuning.tuned, gain, side, bound)
             influence[name] = reason or _influence_beyond(tuning.beyond.get(name), bound)
-    errors = found.gradient_error
+    errors = trust_results.gradient_error
     return {
         "gradient_error": None if errors is None else dict(zip(("start", "end"), errors, strict=True)),
         "influence": influence,
-        "sensitivities": found.sensitivities,
-        "margins": found.margins,
-        "profiles": {name: asdict(profile) for name, profile in found.profiles.items()},
+        "sensitivities": trust_results.sensitivities,
+        "margins": trust_results.margins,
+        "profiles": {name: asdict(profile) for name, profile in trust_results.profiles.items()},
     }
 
 
-def _influence_beyond(seen: BeyondBound | None, bound: float) -> str:
+def _influence_beyond(beyond: BeyondBound | None, bound: float) -> str:
     """Return the results beyond a bound in words."""
-    if seen is None:
+    if beyond is None:
         return f"on its bound {bound:g}; values beyond it were not simulated"
-    if seen.better:
-        return f"better beyond its bound: {seen.times:.3g} times the error at {seen.value:g}, every requirement kept"
-    if seen.broken is not None:
-        return f"no better beyond its bound: at {seen.value:g} {seen.broken}"
-    if seen.times is None:  # no trial reaches its end with the tuned gains, or their error is zero
-        return f"on its bound {bound:g}: every requirement kept at {seen.value:g}, with no error to set that beside"
-    times = f"{seen.times:.3g}"
+    if beyond.is_better:
+        times = f"{beyond.error_ratio:.3g}"
+        return f"better beyond its bound: {times} times the error at {beyond.value:g}, every requirement kept"
+    if beyond.broken is not None:
+        return f"no better beyond its bound: at {beyond.value:g} {beyond.broken}"
+    if beyond.error_ratio is None:  # no trial reaches its end with the tuned gains, or their error is zero
+        return f"on its bound {bound:g}: every requirement kept at {beyond.value:g}; the errors cannot be compared"
+    times = f"{beyond.error_ratio:.3g}"
     error = "the same error" if times == "1" else f"{times} times the error"
-    return f"no better beyond its bound: {error} at {seen.value:g}"
+    return f"no better beyond its bound: {error} at {beyond.value:g}"
 
 
-def write(folder: Path, scenario: Scenario, tuning: Tuning, figures: bool, known_by: Mapping[str, Any]) -> None:
+def write(folder: Path, scenario: Scenario, tuning: Tuning, figures: bool, identity: Mapping[str, Any]) -> None:
     """Write a result folder: `summary.json`, `tuned.toml`, `history.csv` and figures.
 
     Args:
@@ -186,14 +187,14 @@ def write(folder: Path, scenario: Scenario, tuning: Tuning, figures: bool, known
         scenario: the scenario before tuning.
         tuning: the results.
         figures: write figures too.
-        known_by: entries of `versions.json`, see `identity`.
+        identity: entries of `versions.json`, from the function `identity`.
     """
-    store.record(folder, parsing.dump(scenario), known_by, summary(tuning))
-    store.write_toml(folder / "tuned.toml", custom_parts.carry(parsing.dump(tuning.tuned), folder))
+    store.write_run_files(folder, parsing.dump(scenario), identity, summary(tuning))
+    store.write_toml(folder / "tuned.toml", custom_parts.copy_custom_files(parsing.dump(tuning.tuned), folder))
     rows = [
-        [step, row.start, row.value, *row.gains, *row.worst]
+        [step, point.start, point.value, *point.gains, *point.worst]
         for path in _points_by_start(tuning.search.history)
-        for step, row in enumerate(path)
+        for step, point in enumerate(path)
     ]
     store.write_csv(folder / "history.csv", history_columns(scenario, tuning.search.problem.rows), rows)
     if figures:
@@ -205,8 +206,14 @@ def write(folder: Path, scenario: Scenario, tuning: Tuning, figures: bool, known
 def history_columns(scenario: Scenario, limited: Iterable[str]) -> list[str]:
     """Return the column names of `history.csv`; limited: metrics with a column for the ratio of value to limit."""
     tune = scenario.search
-    goal = f"objective_{tune.minimise}" if tune.minimise in (T_F, LIMITS) else f"{tune.statistic}_{tune.minimise}"
-    return ["step", "start", goal, *gain_names.named(scenario), *(f"{metric}_over_limit" for metric in limited)]
+    objective = f"objective_{tune.minimise}" if tune.minimise in (T_F, LIMITS) else f"{tune.statistic}_{tune.minimise}"
+    return [
+        "step",
+        "start",
+        objective,
+        *gain_names.free_gain_names(scenario),
+        *(f"{metric}_over_limit" for metric in limited),
+    ]
 
 
 def _points_by_start(history: Sequence[Step]) -> list[list[Step]]:
@@ -214,18 +221,18 @@ def _points_by_start(history: Sequence[Step]) -> list[list[Step]]:
     return [list(path) for _, path in itertools.groupby(history, lambda step: step.start)]
 
 
-def identity(scenario: Scenario, seed: int, *, globally: bool) -> dict[str, Any]:
+def identity(scenario: Scenario, seed: int, *, with_global_check: bool) -> dict[str, Any]:
     """Return the entries of `versions.json` that identify a tuning run.
 
     Args:
         scenario: the scenario before tuning.
         seed: seed of the search.
-        globally: the run includes a global search for comparison.
+        with_global_check: the run includes a global search for comparison.
     """
     return {
         "command": "tune",
         "seed": seed,
-        **({"global_check": True} if globally else {}),
+        **({"global_check": True} if with_global_check else {}),
         **custom.checksums(scenario),
     }
 
@@ -234,51 +241,51 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
     """Return the figures of a tuning run by name."""
     from ptsmc_jax.figures import study_plots, style  # slow import, not needed before the search ends
 
-    kind, names = scenario.plant.kind, gain_names.named(scenario)
+    kind, names = scenario.plant.kind, gain_names.free_gain_names(scenario)
     unit_of = gain_names.units_of(scenario)
     units = [unit_of[gain_names.base(name)] for name in names]
     paths = _points_by_start(tuning.search.history)
     longest = max(map(len, paths))
 
-    def over_steps(of: Callable[[Step], Any], missing: Any = np.nan) -> np.ndarray:  # result: (steps, starts, ...)
-        beyond = np.full_like(np.asarray(of(paths[0][0])), missing)
-        return np.stack([[of(path[k]) if k < len(path) else beyond for path in paths] for k in range(longest)])
+    def over_steps(value: Callable[[Step], Any], missing: Any = np.nan) -> np.ndarray:  # result: (steps, starts, ...)
+        padding = np.full_like(np.asarray(value(paths[0][0])), missing)
+        return np.stack([[value(path[k]) if k < len(path) else padding for path in paths] for k in range(longest)])
 
-    minimised, shown = scenario.search.minimise, np.asarray
+    minimised, to_unit = scenario.search.minimise, np.asarray
     unit = {T_F: "s", LIMITS: "-", **catalogues.units(kind)}[minimised]
     if minimised == "window_error":
-        shown, _, unit = style.shown_error(kind)
-    goal = f"{objective_name(scenario.search).replace(' window', chr(10) + 'window')} [{unit}]"
-    moved = over_steps(lambda step: step.gains)
+        to_unit, _, unit = style.error_display(kind)
+    objective = f"{objective_name(scenario.search).replace(' window', chr(10) + 'window')} [{unit}]"
+    gains = over_steps(lambda step: step.gains)
     figures: dict[str, Any] = {
         "history": study_plots.tuning_history(
-            {name: (units[k], moved[:, :, k]) for k, name in enumerate(names)},
-            shown(over_steps(lambda step: step.value)),
+            {name: (units[k], gains[:, :, k]) for k, name in enumerate(names)},
+            to_unit(over_steps(lambda step: step.value)),
             over_steps(lambda step: np.all(step.worst <= 1.0), missing=False),
-            goal,
-            (float(shown(tuning.search.value)), dict(zip(names, map(float, tuning.search.gains), strict=True))),
+            objective,
+            (float(to_unit(tuning.search.value)), dict(zip(names, map(float, tuning.search.gains), strict=True))),
         ),
     }
-    ended = {
+    finished_results = {
         gain_names.published_label(scenario) if name == "published" else name: (
             trials.metrics.window_error[trials.finished], trials.metrics.peak_torque[trials.finished]
         )
         for name, trials in tuning.held_out.items()
         if trials.finished.any()
     }  # fmt: skip
-    if ended:
+    if finished_results:
         limit, lower_bound = tables.limit_of(scenario, "peak_torque"), tuning.lower_bounds["tuned"]
-        figures["tradeoff"] = study_plots.tradeoff(ended, limit, kind, lower_bound)
+        figures["tradeoff"] = study_plots.tradeoff(finished_results, limit, kind, lower_bound)
     if tuning.trust is not None and tuning.trust.sensitivities:  # the table is empty if no trial reaches its end
         figures["sensitivities"] = study_plots.tornado(tuning.trust.sensitivities)
     if tuning.trust is not None:
         figures["profiles"] = study_plots.profiles(
             {
                 name: study_plots.Profile(
-                    units[k], p.gain, shown(p.value), p.violation_ratio, p.nearest, float(tuning.search.gains[k])
+                    units[k], p.gain, to_unit(p.value), p.violation_ratio, p.nearest, float(tuning.search.gains[k])
                 )
                 for k, (name, p) in enumerate(tuning.trust.profiles.items())
             },
-            goal,
+            objective,
         )
     return figures

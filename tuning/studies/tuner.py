@@ -28,12 +28,14 @@ from tuning.search.optimise import Search
 from tuning.search.progress import Report
 from tuning.search.trust import Profile
 from tuning.studies import judging, posing, stability
-from tuning.studies.posing import Posed
+from tuning.studies.posing import TuningSetup
 
-WIDENED = 3  # largest number of searches in wider bounds
+MOST_WIDENINGS = 3  # largest number of searches in wider bounds
 TRIES = 3  # largest number of searches; each is judged on its own held-out trials
-FARTHER = 1.02  # a repeated search tightens a limit by its ratio of value to limit on held-out trials and this factor
-SENSITIVE = ("window_error", "hold_error", "peak_torque", "effort", "chattering")  # metrics with sensitivities to gains
+# a repeated search tightens a limit by its ratio of value to limit on the held-out trials, and by this factor
+EXTRA_DISTANCE = 1.02
+# metrics whose sensitivities to the gains are reported
+SENSITIVITY_METRICS = ("window_error", "hold_error", "peak_torque", "effort", "chattering")
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ class Trust:
     gradient_error: tuple[float, float] | None  # relative error at the first and last point; None: discontinuous sign
     profiles: dict[str, Profile]  # objective along each gain
     sensitivities: dict[str, dict[str, float]]
-    margins: dict[str, dict[str, Any]] | None  # stability margins of the tuned gains, see `stability.worst`
+    margins: dict[str, dict[str, Any]] | None  # stability margins of the tuned gains, see `stability.worst_margins`
 
 
 @dataclass(frozen=True)
@@ -51,17 +53,17 @@ class BeyondBound:
     """The results on held-out trials after moving one gain from its bound to a value beyond."""
 
     value: float  # value of the gain, in its unit
-    times: float | None  # RMS window error, relative to the tuned gains; None: an error is missing or zero
+    error_ratio: float | None  # RMS window error, relative to the tuned gains; None: an error is missing or zero
     broken: str | None  # violated requirement, in words; None: all requirements are met, and no trial failed
 
     @property
-    def better(self) -> bool:
+    def is_better(self) -> bool:
         """Whether the error decreases by more than 1 % beyond the bound, with all requirements met."""
-        return self.broken is None and self.times is not None and self.times < 1.0 - trust.FLAT
+        return self.broken is None and self.error_ratio is not None and self.error_ratio < 1.0 - trust.FLAT
 
 
 @dataclass(frozen=True)
-class Try:
+class RejectedSearch:
     """A search whose gains kept every limit on the training trials, but broke a limit on the held-out trials."""
 
     held_out_seed: int  # seed of the held-out trials
@@ -77,10 +79,10 @@ class Tuning:
     tuned: Scenario  # scenario with the tuned gains, on the flight clock
     gains: dict[str, float]
     search: Search
-    earlier: list[Try]
+    earlier: list[RejectedSearch]
     at_bound: dict[str, str]
     training: Trials  # tuned gains on the training trials
-    held_out: dict[str, Trials]  # held-out trials: "tuned" and the keys of `judging.beside`
+    held_out: dict[str, Trials]  # held-out trials: "tuned" and the keys of `judging.reference_scenarios`
     published_unavailable: str | None  # reason why the published gains cannot be simulated
     seed: int  # seed of the training trials and the search
     held_out_seed: int  # seed of the held-out trials
@@ -99,7 +101,7 @@ class Tuning:
     @property
     def met(self) -> bool:
         """Whether the held-out trials meet every requirement, and none of them failed."""
-        return judging.met(self.verdicts, self.held_out["tuned"])
+        return judging.meets_requirements(self.verdicts, self.held_out["tuned"])
 
     @property
     def status(self) -> str:
@@ -126,8 +128,8 @@ def tune(
     report: Report = lambda *_: None,
     journal: Journal | None = None,
     *,
-    globally: bool = False,
-    trusted: bool = True,
+    with_global_check: bool = False,
+    with_checks: bool = True,
     tries: int = TRIES,
 ) -> Tuning:
     """Tune the scenario's free gains (table `tune`) and judge them on held-out trials.
@@ -141,8 +143,8 @@ def tune(
         seed: seed of the training trials and the search. The seeds of the held-out trials follow from it.
         report: called with the progress after every step.
         journal: evaluations of an interrupted run, which then resumes.
-        globally: compare the result with a global search (differential evolution).
-        trusted: compute gradient checks, profiles, sensitivities and margins of the result too.
+        with_global_check: compare the result with a global search (differential evolution).
+        with_checks: compute gradient checks, profiles, sensitivities and margins of the result too.
         tries: largest number of searches.
 
     Returns:
@@ -150,28 +152,32 @@ def tune(
     """
     started = time.monotonic()
     report("compiling", 0, 0, np.nan, 0.0)
-    posed = posing.tuning_problem(scenario, seed, journal)
-    others, refused = judging.beside(scenario)
-    judged, earlier, posed = _search_and_judge(scenario, posed, journal, report, tries)
-    evaluate = posed.evaluate
+    setup = posing.set_up_tuning(scenario, seed, journal)
+    references, published_error = judging.reference_scenarios(scenario)
+    judged, earlier, setup = _search_and_judge(scenario, setup, journal, report, tries)
+    evaluate = setup.evaluate
     outcome, rollouts, gradients = judged.search, evaluate.rollouts, evaluate.gradients
     check = None
-    if globally and not outcome.interrupted:
-        check = global_check.check(evaluate, outcome, seed, report, with_gradients=posed.with_gradients)
-    problem = posed.problem
+    if with_global_check and not outcome.interrupted:
+        check = global_check.check(evaluate, outcome, seed, report, with_gradients=setup.with_gradients)
+    problem = setup.problem
     training = simulations.simulate_trials(
         problem.batch_of(np.arange(problem.averaged)), np.asarray([*judged.gains.values()])
     )
-    candidates = {"tuned": judged.scenario} | {name: judging.on_flight_clock(other) for name, other in others.items()}
-    held_out = {"tuned": judged.trials} | {name: judging.judge(other, judged.seed) for name, other in others.items()}
-    shortest = _shortest(posed, judged)
-    trust_in_it, beyond, at_bound = None, {}, evaluate.bounds.at_bound(outcome.gains)
-    if trusted and not outcome.interrupted:
+    candidates = {"tuned": judged.scenario} | {
+        name: judging.on_flight_clock(other) for name, other in references.items()
+    }
+    held_out = {"tuned": judged.trials} | {
+        name: judging.judge(other, judged.seed) for name, other in references.items()
+    }
+    shortest = _find_shortest_time(setup, judged)
+    trust_checks, beyond_bounds, at_bound = None, {}, evaluate.bounds.at_bound(outcome.gains)
+    if with_checks and not outcome.interrupted:
         report("profiles, sensitivities and margins of the gains found", 0, 0, outcome.value, outcome.violation)
-        trust_in_it = _trust(posed, judged)
-        profiles = trust_in_it.profiles
-        relevant = {name: side for name, side in at_bound.items() if not profiles[name].flat}
-        beyond = _results_beyond_bounds(judged, relevant)
+        trust_checks = _check_result(setup, judged)
+        profiles = trust_checks.profiles
+        relevant = {name: side for name, side in at_bound.items() if not profiles[name].is_flat}
+        beyond_bounds = _results_beyond_bounds(judged, relevant)
     return Tuning(
         tuned=judged.scenario,
         gains=judged.gains,
@@ -180,16 +186,16 @@ def tune(
         at_bound=at_bound,
         training=training,
         held_out=held_out,
-        published_unavailable=refused,
+        published_unavailable=published_error,
         seed=seed,
         held_out_seed=judged.seed,
         judged_gains={name: gains.gains_of(study(one).parts) for name, one in candidates.items()},
         lower_bounds={name: judging.rms_lower_bound(one, judged.seed) for name, one in candidates.items()},
         verdicts=judged.verdicts,
-        broken_by=_broken_by(candidates, held_out, judged.seed),
+        broken_by=_find_broken_requirements(candidates, held_out, judged.seed),
         shortest=shortest,
-        trust=trust_in_it,
-        beyond=beyond,
+        trust=trust_checks,
+        beyond=beyond_bounds,
         check=check,
         rollouts=rollouts,
         gradients=gradients,
@@ -198,78 +204,83 @@ def tune(
 
 
 def _search_and_judge(
-    scenario: Scenario, posed: Posed, journal: Journal | None, report: Report, tries: int
-) -> tuple[_Judged, list[Try], Posed]:
-    """Search, in larger bounds if gains end on default ones, and verify on held-out trials.
+    scenario: Scenario, setup: TuningSetup, journal: Journal | None, report: Report, tries: int
+) -> tuple[_Judged, list[RejectedSearch], TuningSetup]:
+    """Search for gains, in wider bounds if gains end on default bounds, and judge them on held-out trials.
 
-    If these break a limit that the search kept, search again with more distance from the limits.
+    If the gains break a limit there that the search kept, search again with more distance from the limits.
     """
-    # a repeated search has all starting points again: gains that keep more distance may not be near those found
+    # A repeated search uses all starting points: gains with more distance from the limits may be far from these gains.
     starts = scenario.search.starts
-    outcome = posed.search(
-        posed.problem, posed.scenario_gains, starts, report=report, prepare=partial(_prepare, scenario)
+    outcome = setup.search(
+        setup.problem, setup.scenario_gains, starts, report=report, prepare=partial(_compile_judging, scenario)
     )
-    outcome, posed = _in_larger_bounds(outcome, posed, journal, report)
-    look, seed = partial(posed.search, posed.problem, report=report), posed.seed
-    scenario = posed.ready.scenario
-    earlier = list[Try]()
+    outcome, setup = _search_in_wider_bounds(outcome, setup, journal, report)
+    search_again, seed = partial(setup.search, setup.problem, report=report), setup.seed
+    scenario = setup.ready.scenario
+    earlier = list[RejectedSearch]()
     while True:
         report("verifying on held-out trials", 0, 0, outcome.value, outcome.violation)
-        judged = _judge(scenario, posed, outcome, judging.seed_of_judge(seed, len(earlier)))
-        over = _broken_ratios(outcome, judged.verdicts)
-        if not over or outcome.interrupted or len(earlier) + 1 >= tries:
-            return judged, earlier, posed
-        earlier.append(Try(judged.seed, judged.gains, outcome.margins, over))
+        judged = _judge_outcome(scenario, setup, outcome, judging.derive_held_out_seed(seed, len(earlier)))
+        broken_ratios = _broken_ratios(outcome, judged.verdicts)
+        if not broken_ratios or outcome.interrupted or len(earlier) + 1 >= tries:
+            return judged, earlier, setup
+        earlier.append(RejectedSearch(judged.seed, judged.gains, outcome.margins, broken_ratios))
         reached = dict(zip(outcome.problem.rows, outcome.worst, strict=True))  # value over limit on the training trials
-        margins = {name: 1.0 - float(reached[name]) / (FARTHER * over[name]) for name in over}
-        more = look(outcome.gains, starts, margins=outcome.margins | margins)
-        outcome = replace(more, history=[*outcome.history, *_renumbered(outcome.history, more.history)])
+        margins = {name: 1.0 - float(reached[name]) / (EXTRA_DISTANCE * broken_ratios[name]) for name in broken_ratios}
+        repeated = search_again(outcome.gains, starts, margins=outcome.margins | margins)
+        outcome = replace(repeated, history=[*outcome.history, *_renumber_starts(outcome.history, repeated.history)])
 
 
-def _in_larger_bounds(outcome: Search, posed: Posed, journal: Journal | None, report: Report) -> tuple[Search, Posed]:
+def _search_in_wider_bounds(
+    outcome: Search, setup: TuningSetup, journal: Journal | None, report: Report
+) -> tuple[Search, TuningSetup]:
     """Repeat the search in wider bounds while gains end on default bounds that affect the result.
 
     `_relevant_bounds` selects these gains. The bounds of several gains may be widened at the same time. A search
     without improvement ends the repetition.
     """
-    defaulted = posed.ready.scenario.defaulted
-    for _ in range(WIDENED):
-        if outcome.interrupted or not posed.with_gradients:
+    default_bounds = setup.ready.scenario.defaulted
+    for _ in range(MOST_WIDENINGS):
+        if outcome.interrupted or not setup.with_gradients:
             break
-        sides = _relevant_bounds(posed, outcome, posed.evaluate.bounds.at_bound(outcome.gains))
-        scenario = posed.ready.scenario
-        moved = free_gains.widened(scenario, {gains.base(name): side for name, side in sides.items()}, defaulted)
-        if not moved:
+        sides = _relevant_bounds(setup, outcome, setup.evaluate.bounds.at_bound(outcome.gains))
+        scenario = setup.ready.scenario
+        new_bounds = free_gains.widen_bounds(
+            scenario, {gains.base(name): side for name, side in sides.items()}, default_bounds
+        )
+        if not new_bounds:
             break
-        report(f"searching beyond the bounds of {', '.join(moved)}", 0, 0, outcome.value, outcome.violation)
-        larger = posing.tuning_problem(posing.with_bounds(scenario, moved), posed.seed, journal)
-        larger.evaluate.count_on(posed.evaluate)
-        more = larger.search(larger.problem, outcome.gains, 1, report=report)
-        history = [*outcome.history, *_renumbered(outcome.history, more.history)]
-        better = (more.violation, more.value) < (outcome.violation, outcome.value * (1.0 - trust.FLAT))
-        if not better:
-            posed.evaluate.count_on(larger.evaluate)
-            return replace(outcome, history=history), posed
-        outcome, posed = replace(more, history=history), larger
-    return outcome, posed
+        report(f"searching beyond the bounds of {', '.join(new_bounds)}", 0, 0, outcome.value, outcome.violation)
+        wider = posing.set_up_tuning(posing.with_bounds(scenario, new_bounds), setup.seed, journal)
+        wider.evaluate.continue_counts(setup.evaluate)
+        repeated = wider.search(wider.problem, outcome.gains, 1, report=report)
+        history = [*outcome.history, *_renumber_starts(outcome.history, repeated.history)]
+        is_better = (repeated.violation, repeated.value) < (outcome.violation, outcome.value * (1.0 - trust.FLAT))
+        if not is_better:
+            setup.evaluate.continue_counts(wider.evaluate)
+            return replace(outcome, history=history), setup
+        outcome, setup = replace(repeated, history=history), wider
+    return outcome, setup
 
 
-def _relevant_bounds(posed: Posed, outcome: Search, sides: dict[str, str]) -> dict[str, str]:
+def _relevant_bounds(setup: TuningSetup, outcome: Search, sides: dict[str, str]) -> dict[str, str]:
     """Return those gains on a bound whose change affects the result.
 
     The change moves the gain inwards by a tenth of its interval. It must change F or the violation by more than 0.01.
     """
-    names, found = posed.evaluate.bounds.names, outcome.normalised
-    points = np.asarray([found, *(np.where(np.isin(names, name), np.abs(found - 0.1), found) for name in sides)])
-    seen = posed.evaluate.measure(outcome.problem, points)
-    changes = np.abs(seen.f - seen.f[0]) + np.abs(seen.largest_c - seen.largest_c[0])
+    names, normalised = setup.evaluate.bounds.names, outcome.normalised
+    inwards = (np.where(np.isin(names, name), np.abs(normalised - 0.1), normalised) for name in sides)
+    points = np.asarray([normalised, *inwards])
+    results = setup.evaluate.measure(outcome.problem, points)
+    changes = np.abs(results.f - results.f[0]) + np.abs(results.largest_c - results.largest_c[0])
     return {name: side for (name, side), change in zip(sides.items(), changes[1:], strict=True) if change > trust.FLAT}
 
 
-def _judge(scenario: Scenario, posed: Posed, outcome: Search, held_out_seed: int) -> _Judged:
+def _judge_outcome(scenario: Scenario, setup: TuningSetup, outcome: Search, held_out_seed: int) -> _Judged:
     """Simulate the rounded gains of a search on held-out trials."""
     begun = time.monotonic()
-    rounded = posed.named(outcome.normalised)
+    rounded = setup.rounded_gains(outcome.normalised)
     simulated = judging.on_flight_clock(gains.in_scenario(scenario, rounded))
     trials = judging.judge(simulated, held_out_seed)
     return _Judged(
@@ -277,18 +288,20 @@ def _judge(scenario: Scenario, posed: Posed, outcome: Search, held_out_seed: int
     )
 
 
-def _shortest(posed: Posed, judged: _Judged) -> ShortestTime | None:
+def _find_shortest_time(setup: TuningSetup, judged: _Judged) -> ShortestTime | None:
     """Return the shortest t_f [s] that the torque limit allows.
 
     The result is None if there is no torque limit, t_f is tuned, or the law has no prescribed time.
     """
-    asked = next((one for one in posed.ready.requirements if one.metric == "peak_torque"), None)
-    if asked is None or T_F in posed.problem.names or not judged.scenario.controller.law.prescribed:
+    torque_limit = next((r for r in setup.ready.requirements if r.metric == "peak_torque"), None)
+    if torque_limit is None or T_F in setup.problem.names or not judged.scenario.controller.law.prescribed:
         return None
-    return shortest_time(judged.scenario, asked, judged.seed, judged.trials.trial)
+    return shortest_time(judged.scenario, torque_limit, judged.seed, judged.trials.trial)
 
 
-def _broken_by(candidates: dict[str, Scenario], held_out: dict[str, Trials], seed: int) -> dict[str, list[str]]:
+def _find_broken_requirements(
+    candidates: dict[str, Scenario], held_out: dict[str, Trials], seed: int
+) -> dict[str, list[str]]:
     """Return the gains that are more accurate than the tuned gains, and the metrics whose requirements they break.
 
     Accuracy is compared over the trials that reach their end with both sets of gains.
@@ -301,29 +314,29 @@ def _broken_by(candidates: dict[str, Scenario], held_out: dict[str, Trials], see
 
     def more_accurate(trials: Trials) -> bool:
         both = trials.finished & held_out["tuned"].finished
-        there, here = (np.sum(np.asarray(t.metrics.window_error)[both] ** 2) for t in (trials, held_out["tuned"]))
-        return bool(there < here)
+        other, tuned = (np.sum(np.asarray(t.metrics.window_error)[both] ** 2) for t in (trials, held_out["tuned"]))
+        return bool(other < tuned)
 
     return {
-        name: [one.metric for one in judging.verdicts_of(candidates[name], trials, seed) if not one.met]
+        name: [verdict.metric for verdict in judging.verdicts_of(candidates[name], trials, seed) if not verdict.met]
         for name, trials in held_out.items()
         if more_accurate(trials)
     }
 
 
-def _trust(posed: Posed, judged: _Judged) -> Trust:
+def _check_result(setup: TuningSetup, judged: _Judged) -> Trust:
     """Compute gradient errors, profiles, sensitivities and margins of the gains found."""
-    outcome, evaluate = judged.search, posed.evaluate
+    outcome, evaluate = judged.search, setup.evaluate
     gradient_error = None
-    if posed.with_gradients:
-        at_start = trust.gradient_error(evaluate, outcome.problem, evaluate.bounds.normalise(posed.scenario_gains))
+    if setup.with_gradients:
+        at_start = trust.gradient_error(evaluate, outcome.problem, evaluate.bounds.normalise(setup.scenario_gains))
         gradient_error = at_start, trust.gradient_error(evaluate, outcome.problem, outcome.normalised)
-    metrics = tuple(dict.fromkeys([*SENSITIVE, *outcome.problem.metrics]))
+    metrics = tuple(dict.fromkeys([*SENSITIVITY_METRICS, *outcome.problem.metrics]))
     return Trust(
         gradient_error=gradient_error,
         profiles=trust.profiles(evaluate, outcome.problem, outcome.normalised),
         sensitivities=trust.sensitivities(outcome.problem, evaluate.bounds, outcome.gains, metrics),
-        margins=stability.worst(study(judged.scenario)),
+        margins=stability.worst_margins(study(judged.scenario)),
     )
 
 
@@ -334,19 +347,19 @@ def _broken_ratios(outcome: Search, verdicts: list[Verdict]) -> dict[str, float]
     limit, if each broken limit had an effect in the search, and if every value is finite.
     """
     # the search treats a requirement on a fraction of time as a limit at all times
-    over = {one.metric: one.margin if one.interpretation == "ensemble" else one.worst / one.limit
-            for one in verdicts if not one.met and one.limit}  # fmt: skip
-    helped = bool(np.all(outcome.worst <= 1.0)) and all(np.isfinite(ratio) and ratio > 1.0 for ratio in over.values())
+    ratios = {v.metric: v.margin if v.interpretation == "ensemble" else v.worst / v.limit
+              for v in verdicts if not v.met and v.limit}  # fmt: skip
+    can_help = bool(np.all(outcome.worst <= 1.0)) and all(np.isfinite(r) and r > 1.0 for r in ratios.values())
     reached = dict(zip(outcome.problem.rows, outcome.worst, strict=True))  # 0 if no training trial depends on the limit
     # a loop with a limit cycle has no margins, see `theory.limit_cycles`; more distance from the limits does not help
-    swings = any(one.at_least and one.worst == 0.0 for one in verdicts)
-    return over if helped and not swings and all(reached[name] > 0.0 for name in over) else {}
+    has_limit_cycle = any(verdict.at_least and verdict.worst == 0.0 for verdict in verdicts)
+    return ratios if can_help and not has_limit_cycle and all(reached[name] > 0.0 for name in ratios) else {}
 
 
-def _renumbered(history: list[Step], more: list[Step]) -> list[Step]:
+def _renumber_starts(history: list[Step], repeated: list[Step]) -> list[Step]:
     """Return the steps of a repeated search with new numbers of starting points, which follow those of the history."""
     first = 1 + max((step.start for step in history), default=-1)
-    return [replace(step, start=first + step.start) for step in more]
+    return [replace(step, start=first + step.start) for step in repeated]
 
 
 def _results_beyond_bounds(judged: _Judged, at_bound: dict[str, str]) -> dict[str, BeyondBound]:
@@ -363,7 +376,7 @@ def _results_beyond_bounds(judged: _Judged, at_bound: dict[str, str]) -> dict[st
     if not tuned.sampled or tuned.search.minimise != "window_error":
         return beyond
     for name, side in at_bound.items():
-        value = free_gains.beyond(tuned, gains.base(name), side)
+        value = free_gains.value_beyond_bound(tuned, gains.base(name), side)
         if value is None:
             continue
         try:
@@ -372,24 +385,26 @@ def _results_beyond_bounds(judged: _Judged, at_bound: dict[str, str]) -> dict[st
         except ScenarioError:  # no valid scenario beyond the bound
             continue
         both = trials.finished & judged.trials.finished
-        there, here = (trust.rms(np.asarray(t.metrics.window_error)[both]) for t in (trials, judged.trials))
-        broken = _broken(judging.verdicts_of(other, trials, judged.seed), trials)
-        beyond[name] = BeyondBound(value, float(there / here) if both.any() and here > 0.0 else None, broken)
+        error, tuned_error = (trust.rms(np.asarray(t.metrics.window_error)[both]) for t in (trials, judged.trials))
+        failure = _describe_failure(judging.verdicts_of(other, trials, judged.seed), trials)
+        beyond[name] = BeyondBound(
+            value, float(error / tuned_error) if both.any() and tuned_error > 0.0 else None, failure
+        )
     return beyond
 
 
-def _broken(verdicts: list[Verdict], trials: Trials) -> str | None:
+def _describe_failure(verdicts: list[Verdict], trials: Trials) -> str | None:
     """Return the first broken requirement, or the number of failed trials, in words; None: neither."""
-    for one in verdicts:
-        if not one.met:
-            return str(one)
+    for verdict in verdicts:
+        if not verdict.met:
+            return str(verdict)
     failures = int(np.count_nonzero(~trials.ok))
     return f"{failures} of {trials.status.size} held-out trials fail" if failures else None
 
 
-def _prepare(scenario: Scenario) -> None:
+def _compile_judging(scenario: Scenario) -> None:
     """Start to compile the programs that judge gains, in the background."""
     simulated = study(judging.on_flight_clock(scenario))
-    montecarlo.prepare(simulated.parts, simulated.dispersion, judging.held_out_trials(simulated))
+    montecarlo.prepare(simulated.parts, simulated.dispersion, judging.count_held_out_trials(simulated))
     if scenario.sampled:
         run_margins.judged_margins_jit.prepare(simulated.parts)

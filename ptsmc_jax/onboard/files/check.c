@@ -59,7 +59,7 @@ int main(int count, char **given)
 {
     const int single = sizeof(ptsmc_real) == 4;
     /* effect of the attitude's rounding error on the torque just before the hand-over, relative to the largest torque */
-    const double rounding = (single ? 4.8e-7 : 8.9e-16) * ${steepness};
+    const double rounding = (single ? 4.8e-7 : 8.9e-16) * ${rounding_growth};
     const double tolerance = count > 2 ? strtod(given[2], NULL) : fmax(single ? 1e-3 : 1e-12, fmin(rounding, 0.1));
     static double v[COLUMNS], largest[CHECKED], off[CHECKED], found[CHECKED];
     FILE *const file = fopen(count > 1 ? given[1] : "vectors.csv", "r");

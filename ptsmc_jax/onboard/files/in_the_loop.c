@@ -27,7 +27,7 @@ void ptsmc_set(void)
     ptsmc_params_to(&ptsmc_parameters, ptsmc_given);
 }
 
-/* parameters (NaN: ptsmc_given), states, inputs -> states, outputs, statuses */
+/* Make one step for each row of parameters (NaN selects ptsmc_given), states and inputs. */
 void ptsmc_many(long count, const double *params, const double *state, const double *in, double *after, double *out,
                 int *status)
 {
@@ -59,17 +59,19 @@ void ptsmc_many(long count, const double *params, const double *state, const dou
     }
 }
 
+/* Read a row of floats as doubles. */
 static void get(const XLA_FFI_Buffer *from, long k, long size, double *row)
 {
     for (long c = 0; c < size; c++) row[c] = (double)((const float *)from->data)[k * size + c];
 }
 
+/* Write a row of doubles as floats. */
 static void put(const double *row, long k, long size, XLA_FFI_Buffer *to)
 {
     for (long c = 0; c < size; c++) ((float *)to->data)[k * size + c] = (float)row[c];
 }
 
-/* function that XLA calls: the same for arrays of double or float */
+/* The function that XLA calls, for arrays of double or float. */
 XLA_FFI_Error *ptsmc_called(XLA_FFI_CallFrame *frame)
 {
     if (frame->extension_start != NULL && frame->extension_start->type == XLA_FFI_Extension_Metadata) {
