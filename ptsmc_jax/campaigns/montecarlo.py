@@ -173,8 +173,8 @@ def run(
         trials: their numbers, whole numbers below 2^32, or rows of a run table.
         block: trials that a device simulates at a time; None: `block_size()`.
         custom_metrics: custom metrics, see `one`.
-        kernel: whether the loop over time is one kernel, see `batching.kernel`; None: `by_kernel()`. A processor
-            interprets the kernel, slowly.
+        kernel: whether the loop over time is one kernel, see `batching.kernel`; None: `uses_kernel()`. A
+            processor interprets the kernel, slowly.
         software: the flight computer.
 
     Returns:

@@ -67,11 +67,20 @@ def test_the_default_axes_follow_the_period_and_t_f_of_the_scenario(controller, 
     made = scenario.from_tables({"controller": controller, "loop": {"mode": "sampled", "period": period}})
     axes = (
         mapping.parse_axis(mapping.default_period_axis(made), "--x"),
-        mapping.parse_axis(mapping.default_delta_axis(made), "--y"),
+        mapping.parse_axis(mapping.default_gain_axis(made), "--y"),
     )
     assert [axis.key for axis in axes] == ["loop.period", "controller.delta"]
     assert [(axis.values[0], axis.values[-1]) for axis in axes] == ends
     assert [len(axis.values) for axis in axes] == [9, 9]
+
+
+def test_the_default_y_axis_of_a_law_without_delta_is_its_first_gain():
+    law = {"kind": "time_base_sliding", "t_f": 35.0}
+    made = scenario.from_tables({"controller": law, "loop": {"mode": "sampled"}, "observer": {"kind": "none"}})
+    axis = mapping.parse_axis(mapping.default_gain_axis(made), "--y")
+    assert axis.key == "controller.surface_rate"
+    bounds = scenario.replace(made, tune={}).search.bounds["surface_rate"]
+    np.testing.assert_allclose((axis.values[0], axis.values[-1]), bounds, rtol=1e-3)
 
 
 @pytest.mark.parametrize(

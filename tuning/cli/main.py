@@ -135,7 +135,8 @@ def map_(
         Parameter(help="KEY=LOW:HIGH:COUNT; default: loop.period from 0.4 to 10 times the scenario's period."),
     ] = None,
     y: Annotated[
-        str | None, Parameter(help="KEY=LOW:HIGH:COUNT; default: controller.delta from a period to t_f / 7 or more.")
+        str | None,
+        Parameter(help="KEY=LOW:HIGH:COUNT; default: delta from a period to t_f / 7, or the law's first gain."),
     ] = None,
     trials: Annotated[int, whole_number("Trials of each pair, 1 to 1000000.", 1, 1_000_000)] = 32,
     out: Out = None,
@@ -152,7 +153,7 @@ def map_(
     from tuning.studies import mapping
 
     x_axis = mapping.parse_axis(x or mapping.default_period_axis(loaded), "--x")
-    y_axis = mapping.parse_axis(y or mapping.default_delta_axis(loaded), "--y")
+    y_axis = mapping.parse_axis(y or mapping.default_gain_axis(loaded), "--y")
     if x_axis.key == y_axis.key:
         raise UsageError(f"--y is {y_axis.text}, but must be another key than --x")
     with store.lock_folder(folder, force=common.force):

@@ -1,6 +1,7 @@
 """Evaluation of a tuning problem at many points, with a journal. `simulations` simulates and `objective` judges.
 
-`Evaluator` does the evaluation. Its results are `Measured` and, with gradients, `MeasuredWithGradients`.
+`Evaluator` does the evaluation. Its results are `Measurement` and, with gradients,
+`MeasurementWithGradients`.
 """
 
 import re

@@ -147,7 +147,7 @@ def nominal_runs(asked: RequiredMargins, gains: Float[Array, " gains"]) -> linea
 def _map_cases(
     asked: RequiredMargins, gains: Float[Array, " gains"], function: Callable[..., Any], *arguments: Any
 ) -> Any:
-    """Apply `of` to the parts of each case and its entries of `by_case`. Return arrays with cases on the first axis.
+    """Apply `function` to the parts and the `arguments` of each case. Return arrays with cases on the first axis.
 
     The cases are computed one after the other. With a batch axis for the inertia, XLA aborts the process for some sets
     of gains.

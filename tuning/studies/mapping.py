@@ -122,11 +122,22 @@ def default_period_axis(scenario: Scenario) -> str:
     return f"{PERIOD}={0.4 * period:.4g}:{10.0 * period:.4g}:9"
 
 
-def default_delta_axis(scenario: Scenario) -> str:
+def default_gain_axis(scenario: Scenario) -> str:
     """Return the default y axis: delta from one period to t_f / 7.
 
-    The range is extended to include the scenario's delta, and up to twice this delta.
+    The range is extended to include the scenario's delta, and up to twice this delta. For a law without delta, the axis
+    is the law's first gain over its default bounds.
+
+    Raises:
+        UsageError: the law has no gain with bounds.
     """
+    if not hasattr(scenario.controller, "delta"):
+        bounds = replace_keys(scenario, tune={}).search.bounds
+        gain = next((name for name in scenario.controller.gains if name in bounds), None)
+        if gain is None:
+            raise UsageError(f"--y is required: controller.kind = {scenario.controller.kind} has no gain to vary")
+        low, high = bounds[gain]
+        return f"controller.{gain}={low:.4g}:{high:.4g}:9"
     delta, shortest = scenario.hand_over, scenario.loop.period
     longest = max(scenario.controller.t_f / 7.0, 2.0 * delta)
     return f"{DELTA}={min(delta, shortest):.4g}:{longest:.4g}:9"
