@@ -263,7 +263,7 @@ def test_rounding_errors_do_not_delay_the_surface_of_the_hold_phase(bits):
 
 @pytest.mark.parametrize("left", [1.0, 0.5, 0.45, 0.3])
 def test_double_integrator_has_the_same_input_as_a_system_and_as_a_chain(left):
-    """This includes a period that ends at the hand-over and one that contains it."""
+    """In some cases a period ends at the hand-over, and in others the hand-over is inside a period."""
     double = system(1, lambda t, x, v: v, lambda t, x, v: 0.0 * v, lambda t, x, v: jnp.eye(1))
     gains = {
         "t_f": vector(T_F), "eta": vector(2.7), "delta": vector(0.4), "k1": vector(1.3), "sign_width": vector(1e-3),
