@@ -15,6 +15,6 @@ def build(summary: Paper) -> Report:
         [counts, "claims.md states the reasons, and quotes the errors"],
         [
             Section("Claims of the paper", [Table(("verdict", "the paper", "measured"), claims)]),
-            Section("Errors of the paper", [Table(("where", "what it must be", "shown by"), slips)]),
+            Section("Errors of the paper", [Table(("where", "correct", "evidence"), slips)]),
         ],
     )

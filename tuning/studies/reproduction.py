@@ -126,13 +126,13 @@ def _markdown(reproduction: Reproduction) -> str:
     shown = [(s.where, s.paper, s.correct, s.shown) for s in reproduction.slips]
     return "\n".join(
         [
-            "# The paper's claims beside what was measured",
+            "# Claims of the paper and measurements",
             "",
             *_markdown_table(("where", "the paper", "measured", "verdict", "why"), claims),
             "",
-            "# Its slips, and what shows them",
+            "# Errors in the equations of the paper, and their evidence",
             "",
-            *_markdown_table(("where", "the paper", "what it must be", "shown by"), shown),
+            *_markdown_table(("where", "printed in the paper", "correct", "evidence"), shown),
             "",
             "# Remark 2: observers and signs, sampled at 20 Hz, t_f = 35 s, delta = 0.5 s, no noise",
             "",
