@@ -49,26 +49,26 @@ def main() -> None:
     })  # fmt: skip
     logs = [telemetry.measurements(loaded, frame, f"log {k}") for k, frame in enumerate(frames)]
     problem = parameters.build(loaded, logs)
-    gate = estimation._gate(loaded)
+    gate = estimation._innovation_gate(loaded)
     search = estimation.Search(problem, [], gate, lambda text: None)
     zero = np.zeros(problem.size)
     truth = problem.numbers(zero)
     errors, bounds, inside, far, converged, not_white, seconds = [], [], [], [], 0, 0, []
     for k, log in enumerate(logs):
-        one = estimation.prepared(problem, log)
+        one = estimation.prepare_log(problem, log)
         search.logs = [one]
         if k == 0:
             begun = time.perf_counter()
             search.derivatives(zero, search.logs)
-            search.screened(zero, one)
+            search.reject_outliers(zero, one)
             print(f"compiling and a first evaluation: {time.perf_counter() - begun:.1f} s", flush=True)
         begun, processor = time.perf_counter(), time.process_time()
         start = rng.uniform(-1.0, 1.0, problem.size)
-        found = search.best(start, parameters.acceleration(problem.model, log), 3)
+        found = search.find_best(start, parameters.commanded_acceleration(problem.model, log), 3)
         seconds.append((time.perf_counter() - begun, time.process_time() - processor))
-        good = search.screened(found.z, one)
-        not_white += not estimation.Fit(log, one[0], *search.filtered(found.z, good)).white
-        _, _, information, _ = search.derivatives(zero, [search.screened(zero, one)])
+        good = search.reject_outliers(found.z, one)
+        not_white += not estimation.Fit(log, one[0], *search.run_filter(found.z, good)).is_white
+        _, _, information, _ = search.derivatives(zero, [search.reject_outliers(zero, one)])
         at_truth = problem.derivatives(zero)
         bound = np.sqrt(np.diag(at_truth @ np.linalg.inv(information) @ at_truth.T))
         at_estimate = problem.derivatives(found.z)

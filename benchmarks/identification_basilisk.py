@@ -220,7 +220,9 @@ def main() -> None:
             sigmas = (estimate - truth) / std
             all_sigmas += sigmas.tolist()
             fit = found.fits[0]
-            print(f"{case.name}, log {seed}: mean square of the innovations {fit.square:.3f}, white: {fit.white}")
+            print(
+                f"{case.name}, log {seed}: mean square of the innovations {fit.mean_square:.3f}, white: {fit.is_white}"
+            )
             if seed == 0:
                 print("\n| parameter | estimate | true value | standard deviation | error in standard deviations |")
                 print("|---|---|---|---|---|")

@@ -32,9 +32,9 @@ def main() -> None:
     slew = explore.simulate(scenario.replace(off, spacecraft__true_inertia=body)).to_polars()
     free = scenario.replace(off, identify={"free": ["inertia"], "prior": "none"})
     found = explore.identify(free, slew)
-    print(f"{found}\nwhite: {found.fits[0].white}", flush=True)
+    print(f"{found}\nwhite: {found.fits[0].is_white}", flush=True)
     print("| model | RMS terminal error | RMS window error | largest torque [N m] | complete trials |", flush=True)
-    for name, model in (("true", true), ("identified", results.identified(found)), ("20 % off", off)):
+    for name, model in (("true", true), ("identified", results.identified_scenario(found)), ("20 % off", off)):
         started = time.monotonic()
         tuned = gains.in_scenario(model, tuner.tune(model, 0, with_checks=False).gains)
         on_body = scenario.replace(tuned, spacecraft__true_inertia=body, dispersion__inertia=None)

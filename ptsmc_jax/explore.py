@@ -151,7 +151,7 @@ class Identified(estimation.Identification):
     @property
     def identified_scenario(self) -> Scenario:
         """The scenario with the estimates, and with their covariance in [dispersion]."""
-        return results.identified(self)
+        return results.identified_scenario(self)
 
     @property
     def verdict(self) -> list[str]:
@@ -363,7 +363,7 @@ def identify(
     frames = [*([log] if isinstance(log, pl.DataFrame) else log), *validate]
     logs = [telemetry.measurements(loaded, frame, f"log {k + 1}") for k, frame in enumerate(frames)]
     used = len(logs) - len(validate)
-    estimated = estimation.of_logs(loaded, logs[:used], logs[used:], free, report)
+    estimated = estimation.estimate_parameters(loaded, logs[:used], logs[used:], free, report)
     return Identified(**{field.name: getattr(estimated, field.name) for field in fields(estimated)})
 
 

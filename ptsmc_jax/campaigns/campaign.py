@@ -119,7 +119,7 @@ class Campaign:
         for name in simulated.custom_metrics:
             if not custom_checks.is_column_name(name):
                 raise ValueError(f"its {name!r} is no name of a column; allowed are names that can be printed")
-            if name in {"trial", *run_tables.OF_ROWS.values(), *run_tables.RESULTS, *counts, *simulated.drawn}:
+            if name in {"trial", *run_tables.RESULT_COLUMNS.values(), *run_tables.RESULTS, *counts, *simulated.drawn}:
                 raise ValueError(f"its {name} has the name of a column that the rows have already")
         return list(simulated.custom_metrics)
 
@@ -288,9 +288,9 @@ def _history(
     parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Array | Row, software: Software
 ) -> tuple:
     def simulate_one(trial: jax.Array | Row) -> tuple:
-        trial_parts = table_rows.about(parts, dispersion, seed, trial)
+        trial_parts = table_rows.trial_setup(parts, dispersion, seed, trial)
         log = rollout.simulate(
-            trial_parts.drawn, trial_parts.seed, trial_parts.trial, record=True, software=software
+            trial_parts.dispersed_parts, trial_parts.seed, trial_parts.trial, record=True, software=software
         ).log
         assert log is not None
         return log.t, jnp.sqrt(jnp.sum(log.error**2, axis=-1)), log.has_length

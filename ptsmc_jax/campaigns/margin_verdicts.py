@@ -190,7 +190,7 @@ def _loops_and_margins(
         return {name: _worst_value(name, v) for name, v in margins.estimate(loop).items()}
 
     def simulate_trial(trial: Array | Row) -> tuple[Parts, linear.NominalRun]:
-        drawn = table_rows.about(parts, dispersion, seed, trial).drawn
+        drawn = table_rows.trial_setup(parts, dispersion, seed, trial).dispersed_parts
         return drawn, linear.simulate_nominal(drawn)
 
     def loops_of_trial(drawn: Parts, run: linear.NominalRun) -> linear.Loop:

@@ -114,7 +114,7 @@ def one(
     """
     check_parts(parts)
     check_dispersion(dispersion)
-    trial_parts = table_rows.about(parts, dispersion, seed, trial)
+    trial_parts = table_rows.trial_setup(parts, dispersion, seed, trial)
     if coordinates is None:
         coordinates = trial_parts.dispersion.coordinates(trial_parts.seed, trial_parts.trial)
     drawn = trial_parts.dispersion.at(trial_parts.parts, coordinates)
@@ -134,7 +134,7 @@ def coordinates(dispersion: Dispersion, seed: jax.Array, trials: jax.Array) -> C
 
 def values(parts: Parts, dispersion: Dispersion, seed: WholeNumber, trial: WholeNumber | Row) -> dict[str, jax.Array]:
     """Return the dispersed quantities of a trial by name, without simulating it; arguments as for `one`."""
-    trial_parts = table_rows.about(parts, dispersion, seed, trial)
+    trial_parts = table_rows.trial_setup(parts, dispersion, seed, trial)
     coordinates = trial_parts.dispersion.coordinates(trial_parts.seed, trial_parts.trial)
     return _read_dispersed_values(
         dispersion, trial_parts.dispersion.at(trial_parts.parts, coordinates), trial_parts, coordinates
@@ -142,7 +142,7 @@ def values(parts: Parts, dispersion: Dispersion, seed: WholeNumber, trial: Whole
 
 
 def _read_dispersed_values(
-    dispersion: Dispersion, drawn: Parts, trial_parts: table_rows.About, coordinates: Coordinates
+    dispersion: Dispersion, drawn: Parts, trial_parts: table_rows.TrialSetup, coordinates: Coordinates
 ) -> dict[str, jax.Array]:
     """Read the quantities from the parts of a trial; add the gyro's bias and numbers of custom dispersions."""
     by_column = dispersion.values(drawn, set(trial_parts.given) - {RATE_BIAS})

@@ -16,7 +16,7 @@ import polars as pl
 
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.dispersions.quantities import QUANTITIES, UnfitError
-from ptsmc_jax.dispersions.table_rows import OF_ROWS, SEED, TRIAL, Row
+from ptsmc_jax.dispersions.table_rows import RESULT_COLUMNS, SEED, TRIAL, Row
 from ptsmc_jax.numerics import csv_tables
 from ptsmc_jax.scenario import parsing
 from ptsmc_jax.simulation import computer
@@ -77,7 +77,7 @@ class RunTable:
 
     def origin(self, numbers: np.ndarray) -> dict[str, np.ndarray]:
         """Return the columns of a campaign's rows that name the random numbers of these rows."""
-        return {OF_ROWS[name]: values[numbers] for name, values in self._random_number_columns.items()}
+        return {RESULT_COLUMNS[name]: values[numbers] for name, values in self._random_number_columns.items()}
 
     def frame(self, parts: Parts) -> pl.DataFrame:
         """Return the table as a data frame, in one form for equal run tables."""
@@ -136,15 +136,15 @@ def check_table(
     for column in table.columns:
         if column not in (
             *quantity_of,
-            *OF_ROWS,
-            *OF_ROWS.values(),
+            *RESULT_COLUMNS,
+            *RESULT_COLUMNS.values(),
             ANGLE,
             *RESULTS,
             *SAMPLES,
             *custom_metrics,
             *drawn,
         ):
-            suggestion = parsing.nearest_name_hint(column, (*quantity_of, *OF_ROWS))
+            suggestion = parsing.nearest_name_hint(column, (*quantity_of, *RESULT_COLUMNS))
             raise RefusedError(f"{where} has the column {column}, which no trial of this scenario has; {suggestion}")
     given: dict[str, np.ndarray] = {}
     for column in table.columns:
@@ -161,15 +161,15 @@ def check_table(
     name = ""
     try:
         for name, values in given.items():
-            given[name] = QUANTITIES[name].checked(values)
+            given[name] = QUANTITIES[name].validate(values)
         for name in given:
-            QUANTITIES[name].check_with(given, parts)
+            QUANTITIES[name].check_together(given, parts)
     except UnfitError as error:
         row, columns = ", ".join(f"{v:.9g}" for v in given[name][error.row]), columns_of[name]
         heading = columns[0] if len(columns) == 1 else f"{_column_range(columns)} ="
         raise _row_error(where, heading, error.row, row, str(error)) from None
     stated_numbers = {}
-    for name, other in OF_ROWS.items():  # rows of a campaign name the trial in the other column
+    for name, other in RESULT_COLUMNS.items():  # rows of a campaign name the trial in the other column
         column = other if other in table.columns else name
         stated_numbers[name] = _whole_numbers(table, column, where) if column in table.columns else None
     if stated_numbers[TRIAL] is not None and np.array_equal(stated_numbers[TRIAL], np.arange(table.height)):

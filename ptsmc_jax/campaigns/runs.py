@@ -158,7 +158,7 @@ def prepare(ready: Study) -> None:
 
 @programs.jit
 def _dispersed_parts(dispersion: Dispersion, parts: Parts, seed: jax.Array, trial: jax.Array | Row) -> Parts:
-    return table_rows.about(parts, dispersion, seed, trial).drawn
+    return table_rows.trial_setup(parts, dispersion, seed, trial).dispersed_parts
 
 
 def rms_lower_bound(ready: Study, seed: int = 0, rows: Sequence[int | Row] = ()) -> float | None:

@@ -21,7 +21,7 @@ Coordinates = dict[str, Array]  # standard random numbers of a trial, by the nam
 # names of quantities, which are also the names of their random streams
 INITIAL_ATTITUDE, INITIAL_STATE, INITIAL_RATE = "initial_attitude", "initial_state", "initial_rate"
 INERTIA, REFERENCE = "inertia", "reference"
-CUSTOM = "own"  # [dispersion] custom; a stream of another name would have other random numbers
+CUSTOM = "own"  # [dispersion] custom; the name of its stream must not change, because the random numbers depend on it
 DISTURBANCE_PHASE, DISTURBANCE_AMPLITUDE = "disturbance_phase", "disturbance_amplitude"
 DISTURBANCE_BIAS = "disturbance_bias"
 
@@ -49,8 +49,8 @@ class UnfitError(ValueError):
             raise UnfitError(row, allowed(row))
 
 
-Checked = Callable[[np.ndarray], np.ndarray]
-Given = Mapping[str, np.ndarray]  # values (rows, n) of a run table, by the name of the quantity
+Validator = Callable[[np.ndarray], np.ndarray]
+TableValues = Mapping[str, np.ndarray]  # values (rows, n) of a run table, by the name of the quantity
 
 
 class Quantity(NamedTuple):
@@ -64,9 +64,10 @@ class Quantity(NamedTuple):
         combine: (random numbers, nominal numbers, parts) -> numbers of the trial, or one such function by distribution.
         size: (parts) -> number of random numbers. None: one for each column.
         unit: unit for a spacecraft, of all numbers or of each number.
-        checked: (values of a run table (rows, n)) -> values to simulate (rows, n). It raises UnfitError for invalid
-            ones.
-        check_with: (all values of a run table, parts) -> None. It raises UnfitError if values do not fit each other.
+        validate: (values of a run table (rows, n)) -> values to simulate (rows, n). It raises UnfitError for invalid
+            values.
+        check_together: (all values of a run table, parts) -> None. It raises UnfitError if values of several quantities
+            contradict each other.
         categories: columns without an order, such as the number of a wheel.
         hardware: whether it is an error of the hardware or of the flexible modes that the flight software does not
             know.
@@ -78,8 +79,8 @@ class Quantity(NamedTuple):
     combine: Combine | Mapping[str, Combine] = add_to_nominal
     size: Callable[[Parts], int] | None = None
     unit: str | tuple[str, ...] = "-"
-    checked: Checked = lambda rows: rows
-    check_with: Callable[[Given, Parts], None] = lambda given, parts: None
+    validate: Validator = lambda rows: rows
+    check_together: Callable[[TableValues, Parts], None] = lambda table, parts: None
     categories: tuple[str, ...] = ()
     hardware: bool = False
 
@@ -136,20 +137,20 @@ def field_quantity(
     return Quantity(columns, lambda parts: jnp.ravel(jnp.asarray(value(parts))), write, **others)
 
 
-def validator(is_valid: Callable[[np.ndarray], np.ndarray], allowed: str) -> Checked:
-    """Return a validator for `Quantity.checked` that raises UnfitError for the first invalid row.
+def validator(is_valid: Callable[[np.ndarray], np.ndarray], allowed: str) -> Validator:
+    """Return a validator for `Quantity.validate` that raises UnfitError for the first invalid row.
 
     Args:
         is_valid: (rows, n) [SI units] -> (rows, ..) bool, all true for a valid row.
         allowed: the allowed values, in words.
     """
 
-    def checked(rows: np.ndarray) -> np.ndarray:
+    def validate(rows: np.ndarray) -> np.ndarray:
         """Return the rows (rows, n) [SI units] unchanged. Raise UnfitError if a row is invalid."""
         UnfitError.check(np.asarray(is_valid(rows).reshape(len(rows), -1).all(axis=1)), lambda row: allowed)
         return rows
 
-    return checked
+    return validate
 
 
 not_negative = validator(lambda numbers: numbers >= 0.0, "numbers of at least 0")

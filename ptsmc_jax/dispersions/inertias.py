@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ptsmc_jax.dispersions.numbers import FARTHEST
+from ptsmc_jax.dispersions.numbers import TRUNCATION_SIGMAS
 from ptsmc_jax.numerics import attitude, draws, guards, matrices
 from ptsmc_jax.numerics.pytrees import Leaf, pytree
 
@@ -23,11 +23,11 @@ SLENDER_CANDIDATES = 4  # samples of `_sample_slender` if no candidate is physic
 class RelativeInertia:
     """True inertia with random principal moments and axes.
 
-    Each moment has a relative error from a truncated normal distribution, which ends at `FARTHEST` standard deviations.
-    A sample is physical if each moment is at most the sum of the other two. The first physical one of `CANDIDATES`
-    samples is used. For slender bodies often all of them are unphysical. Then the first physical one of
-    `SLENDER_CANDIDATES` samples of `_sample_slender` is used. If all of these are unphysical too, in less than one of
-    1e10 trials, the trial is nominal.
+    Each moment has a relative error from a normal distribution, truncated at `TRUNCATION_SIGMAS` standard deviations.
+    A sample is physical if each moment is at most the sum of the other two. The first physical sample of `CANDIDATES`
+    samples is used. For slender bodies often no sample is physical. Then the first physical sample of
+    `SLENDER_CANDIDATES` samples of `_sample_slender` is used. If none of these is physical either, which happens in
+    less than one of 1e10 trials, the trial is nominal.
     """
 
     moments: Leaf  # (3,) nominal principal moments [kg m^2]
@@ -39,23 +39,23 @@ class RelativeInertia:
 
     def at(self, c: Float[Array, " n"]) -> tuple[Float[Array, "3 3"], Float[Array, "3 3"]]:
         """Return the inertia [kg m^2] and its inverse, (3, 3) each, for standard normal numbers c (count,) [-]."""
-        plain, turn, slender = jnp.split(c, (3 * CANDIDATES, 3 * CANDIDATES + 3))
+        plain, rotation, slender_c = jnp.split(c, (3 * CANDIDATES, 3 * CANDIDATES + 3))
         candidates = plain.reshape(CANDIDATES, 3), jnp.ones(CANDIDATES, dtype=bool)
         # loops over the samples have a fraction of the code to compile
         permutation = jnp.eye(3)[jnp.argsort(self.moments)]  # outside the loop, because a GPU kernel cannot sort
-        more = jax.lax.map(partial(self._sample_slender, permutation), slender.reshape(SLENDER_CANDIDATES, 4))
-        errors, accepted = jax.tree.map(lambda *both: jnp.concatenate(both), candidates, more)
+        slender = jax.lax.map(partial(self._sample_slender, permutation), slender_c.reshape(SLENDER_CANDIDATES, 4))
+        errors, accepted = jax.tree.map(lambda *both: jnp.concatenate(both), candidates, slender)
 
         def find_first(found: tuple[Array, Array], candidate: tuple[Array, Array]) -> tuple[tuple[Array, Array], None]:
             """Return whether a physical sample has been found, and the moments of the first one."""
             (is_found, moments), (error, is_accepted) = found, candidate
             sample = self.moments * (1.0 + self.std * error)
             is_physical = (2.0 * jnp.max(sample) <= jnp.sum(sample)) & (jnp.min(sample) > 0.0)
-            is_valid = is_accepted & is_physical & (jnp.max(jnp.abs(error)) <= FARTHEST)
+            is_valid = is_accepted & is_physical & (jnp.max(jnp.abs(error)) <= TRUNCATION_SIGMAS)
             return (is_found | is_valid, jnp.where(is_valid & ~is_found, sample, moments)), None
 
         (_, moments), _ = jax.lax.scan(find_first, (jnp.asarray(False), self.moments), (errors, accepted))
-        q = attitude.from_rotation_vector(self.turn * turn)
+        q = attitude.from_rotation_vector(self.turn * rotation)
         axes = self.axes @ jnp.stack([attitude.rotate(q, axis) for axis in jnp.eye(3)], axis=1)
         return (axes @ jnp.diag(moments)) @ axes.T, (axes @ jnp.diag(1.0 / moments)) @ axes.T
 
@@ -83,12 +83,12 @@ class RelativeInertia:
         c, a, b = permutation @ self.moments
         r, std = guards.norm(jnp.stack([a, b])), jnp.where(self.std > 0.0, self.std, 1.0)
 
-        def ends(s: Array) -> tuple[Array, Array]:
+        def interval_ends(s: Array) -> tuple[Array, Array]:
             """Return the ends of the interval of u, mapped by `_to_uniform`. Their difference is 2 W(s)."""
             limit = c * (1.0 + std * s)
             return _to_uniform((b - a - limit) / (std * r)), _to_uniform((b - a + limit) / (std * r))
 
-        (low, high), plus, minus = (ends(s) for s in (jnp.zeros_like(c), n[0], -n[0]))
+        (low, high), plus, minus = (interval_ends(s) for s in (jnp.zeros_like(c), n[0], -n[0]))
         accepts_plus = plus[1] - plus[0] > (high - low) * (1.0 + _to_uniform(n[1]))
         accepts_minus = minus[1] - minus[0] > (high - low) * (1.0 - _to_uniform(n[1]))
         s, (low, high) = guards.select(accepts_plus, (n[0], plus), (-n[0], minus))

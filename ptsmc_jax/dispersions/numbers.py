@@ -1,7 +1,7 @@
 """Random numbers of one quantity, x = low + spread u, and functions that combine them with the nominal numbers.
 
-u has a standard distribution. It is a smooth function of a coordinate, which is uniform on (0, 1) or standard normal.
-The coordinates of a trial are random. A search for the worst case optimises them. Read `RandomNumbers` first.
+u has a standard distribution. It is a smooth function of a coordinate that is uniform on (0, 1) or standard normal.
+In a trial the coordinates are random. A search for the worst case optimises them instead. Read `RandomNumbers` first.
 """
 
 import math
@@ -19,8 +19,8 @@ from ptsmc_jax.numerics.pytrees import Leaf, pytree, vector
 
 Numbers = Float[Array, " n"]  # numbers of a quantity
 Random = Float[Array, " count"]  # random numbers of a quantity
-FARTHEST = 3.0  # standard deviations at which a truncated normal distribution ends
-_CENTRAL = math.erf(FARTHEST / math.sqrt(2.0))
+TRUNCATION_SIGMAS = 3.0  # standard deviations at which a truncated normal distribution ends
+_INSIDE = math.erf(TRUNCATION_SIGMAS / math.sqrt(2.0))  # of a normal number inside the truncation
 
 
 class _Standard(NamedTuple):
@@ -33,7 +33,7 @@ class _Standard(NamedTuple):
 
 _STANDARD = {
     "normal": _Standard("normal", lambda c: c),
-    "truncated_normal": _Standard("uniform", lambda c: jax.lax.erf_inv((2.0 * c - 1.0) * _CENTRAL), math.sqrt(2.0)),
+    "truncated_normal": _Standard("uniform", lambda c: jax.lax.erf_inv((2.0 * c - 1.0) * _INSIDE), math.sqrt(2.0)),
     "uniform": _Standard("uniform", lambda c: 2.0 * c - 1.0),  # on (-1, 1)
     "interval": _Standard("uniform", lambda c: c),  # on (0, 1)
     "axis_angle": _Standard("uniform", lambda c: c),  # z component and azimuth of the axis, and angle, each on (0, 1)
@@ -93,8 +93,7 @@ def any_attitude() -> RandomNumbers:
     return RandomNumbers("any_attitude", vector(np.ones(4)))
 
 
-# Type of the functions below: (random numbers (count,), nominal numbers (n,), nominal parts) -> numbers of the trial
-# (n,)
+# (random numbers (count,), nominal numbers (n,), nominal parts) -> numbers of the trial (n,), see the functions below
 Combine = Callable[[Random, Numbers, Any], Numbers]
 
 

@@ -23,8 +23,8 @@ from ptsmc_jax.dispersions.base import (
     INITIAL_RATE,
     INITIAL_STATE,
     REFERENCE,
-    Given,
     Quantity,
+    TableValues,
     UnfitError,
     error_message,
     field_quantity,
@@ -47,7 +47,7 @@ from ptsmc_jax.plants.rigid_body import Spacecraft
 from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation.rollout import Parts
 
-NEAR = 1e-6  # largest error of the norm of a unit vector or quaternion in a run table
+NORM_TOLERANCE = 1e-6  # largest error of the norm of a unit vector or quaternion in a run table
 PAIRS = [(i, j) for i in range(3) for j in range(i, 3)]  # the upper triangle, in the order of the inertia's columns
 # index in PAIRS for each entry of a symmetric matrix
 _PAIR_INDICES = [[PAIRS.index((min(i, j), max(i, j))) for j in range(3)] for i in range(3)]
@@ -64,7 +64,7 @@ def level_name(name: str) -> str:
 def _normalise(q: np.ndarray) -> np.ndarray:
     """Return unit quaternions (rows, 4). Quaternions with a norm of 1 up to rounding errors are not changed."""
     norm = np.linalg.norm(q, axis=1)
-    UnfitError.check(np.abs(norm - 1.0) <= NEAR, lambda k: f"a unit quaternion (its norm is {norm[k]:.9g})")
+    UnfitError.check(np.abs(norm - 1.0) <= NORM_TOLERANCE, lambda k: f"a unit quaternion (its norm is {norm[k]:.9g})")
     is_normalised = np.abs(norm - 1.0) < 1e-14
     return np.where(is_normalised[:, None], q, q / norm[:, None])
 
@@ -85,10 +85,10 @@ def _to_matrices(rows: np.ndarray) -> np.ndarray:
 
 
 def _check_inertia(rows: np.ndarray) -> np.ndarray:
-    full = _to_matrices(rows)
+    tensors = _to_matrices(rows)
     UnfitError.check(
-        formulas.is_rigid_body(full),
-        lambda k: f"a rigid body's inertia ({error_message(formulas.check_inertia, full[k])})",
+        formulas.is_rigid_body(tensors),
+        lambda k: f"a rigid body's inertia ({error_message(formulas.check_inertia, tensors[k])})",
     )
     return rows
 
@@ -98,15 +98,15 @@ def _count_modes(parts: Parts) -> int:
     return getattr(parts.plant, "frequency", np.zeros(0)).shape[-1]
 
 
-def _check_flexible_body(given: Given, parts: Parts) -> None:
+def _check_flexible_body(table: TableValues, parts: Parts) -> None:
     """Check that inertia and coupling of each row, or the nominal ones, belong to a physical flexible body."""
     if not _count_modes(parts):
         return
-    body, count = paths.get(parts, "plant"), len(next(iter(given.values())))
-    inertia = _to_matrices(given[INERTIA]) if INERTIA in given else np.broadcast_to(body.inertia, (count, 3, 3))
+    body, count = paths.get(parts, "plant"), len(next(iter(table.values())))
+    inertia = _to_matrices(table[INERTIA]) if INERTIA in table else np.broadcast_to(body.inertia, (count, 3, 3))
     changed, coupling = "inertia", np.broadcast_to(body.coupling, (count, *body.coupling.shape))
-    if "mode_coupling" in given:
-        changed, coupling = "coupling", given["mode_coupling"].reshape(coupling.shape)
+    if "mode_coupling" in table:
+        changed, coupling = "coupling", table["mode_coupling"].reshape(coupling.shape)
     UnfitError.check(
         formulas.is_flexible_body(inertia, coupling),
         lambda k: f"a flexible body's {changed} ({error_message(formulas.rest_inertia, inertia[k], coupling[k])})",
@@ -131,7 +131,7 @@ def _disturbance_quantity(name: str, field: Literal["phase", "amplitude"], **oth
 # --- actuators and sample times ---
 
 
-def channels(parts: Parts) -> Float[Array, "m channels"]:
+def channel_directions(parts: Parts) -> Float[Array, "m channels"]:
     """Return the directions (m, channels) [-] of the actuators in the design model: body axes, or wheel axes."""
     wheels = parts.actuators.wheels
     return jnp.eye(parts.plant.inputs) if wheels is None else wheels.axes
@@ -139,7 +139,7 @@ def channels(parts: Parts) -> Float[Array, "m channels"]:
 
 def _count_channels(parts: Parts) -> int:
     """Return the number of actuator channels, 0 in the continuous loop."""
-    return channels(parts).shape[1] if parts.clock.sampled else 0
+    return channel_directions(parts).shape[1] if parts.clock.sampled else 0
 
 
 def _with_actuators(parts: Parts, **changes: Any) -> Parts:
@@ -154,7 +154,7 @@ def _read_scale(parts: Parts) -> Numbers:
 def _read_directions(parts: Parts) -> Numbers:
     """Return the true directions of the channels, one after another, (3 channels,) [-]."""
     directions = parts.actuators.directions
-    return jnp.ravel((channels(parts) if directions is None else directions).T)
+    return jnp.ravel((channel_directions(parts) if directions is None else directions).T)
 
 
 def _rotate_channels(random: Random, nominal: Numbers, parts: Parts) -> Numbers:
@@ -164,7 +164,7 @@ def _rotate_channels(random: Random, nominal: Numbers, parts: Parts) -> Numbers:
     return jnp.concatenate(rotated)
 
 
-def _read_failure(parts: Parts) -> Numbers:
+def _read_wheel_failure(parts: Parts) -> Numbers:
     """Return the failure time [s] and the number of the wheel, from 1, (2,). Without a failure: infinity and 0."""
     times = parts.actuators.failure_times
     if times is None:
@@ -173,28 +173,28 @@ def _read_failure(parts: Parts) -> Numbers:
     return jnp.stack([jnp.min(times), jnp.where(jnp.any(jnp.isfinite(times)), wheel, 0.0)])
 
 
-def _with_failure(parts: Parts, failure: Numbers) -> Parts:
-    wheel = jnp.arange(channels(parts).shape[1]).astype(float) + 1.0
+def _with_wheel_failure(parts: Parts, failure: Numbers) -> Parts:
+    wheel = jnp.arange(channel_directions(parts).shape[1]).astype(float) + 1.0
     return _with_actuators(parts, failure_times=jnp.where(wheel == failure[1], failure[0], jnp.inf))
 
 
-def _choose_wheel(random: Random, nominal: Numbers, parts: Parts) -> Numbers:
+def _random_wheel_failure(random: Random, nominal: Numbers, parts: Parts) -> Numbers:
     """Return the failure time [s] and the number of the wheel, from a random time and a random number on (0, 1)."""
-    return jnp.stack([random[0], 1.0 + jnp.floor(random[1] * channels(parts).shape[1])])
+    return jnp.stack([random[0], 1.0 + jnp.floor(random[1] * channel_directions(parts).shape[1])])
 
 
-def _check_wheel(given: Given, parts: Parts) -> None:
-    wheel, last = given["wheel_failure"][:, 1], channels(parts).shape[1]
+def _check_wheel_failure(table: TableValues, parts: Parts) -> None:
+    wheel, last = table["wheel_failure"][:, 1], channel_directions(parts).shape[1]
     is_valid = (wheel == np.round(wheel)) & (wheel >= 0.0) & (wheel <= last)
     UnfitError.check(is_valid, lambda row: f"a time and the number of a wheel, from 1 to {last}, or 0 for none")
 
 
-def _check_jitter(given: Given, parts: Parts) -> None:
+def _check_jitter(table: TableValues, parts: Parts) -> None:
     """Check that no control period is longer than the averaging window of the pointing metrics."""
     if parts.pointing is not None:
         largest = 0.5 * (float(parts.pointing.window) / float(parts.period) - 1.0)
         message = f"at most {largest:.6g}, so that no period is longer than pointing.window"
-        UnfitError.check(given["timing_jitter"][:, 0] <= largest + 1e-9, lambda row: message)
+        UnfitError.check(table["timing_jitter"][:, 0] <= largest + 1e-9, lambda row: message)
 
 
 def _vector_columns(name: str, count: int) -> list[str]:
@@ -210,7 +210,7 @@ QUANTITIES: dict[str, Quantity] = {
         "initial.q",
         "initial_q",
         combine={"normal": rotate_nominal, "axis_angle": rotate_from_reference, "any_attitude": replace_nominal},
-        checked=_normalise,
+        validate=_normalise,
     ),
     INITIAL_RATE: field_quantity("initial.w", "initial_w", unit="rad/s"),
     INITIAL_STATE: Quantity(
@@ -225,15 +225,15 @@ QUANTITIES: dict[str, Quantity] = {
         "reference.q",
         "reference_q",
         combine={"normal": rotate_nominal, "axis_angle": rotate_about_axis, "any_attitude": replace_nominal},
-        checked=_normalise,
+        validate=_normalise,
     ),
     INERTIA: Quantity(  # its random numbers: `RelativeInertia`
         lambda parts: [f"{INERTIA}_{i + 1}{j + 1}" for i, j in PAIRS] if hasattr(parts.plant, "with_inertia") else [],
         lambda parts: jnp.stack([paths.get(parts, "plant.inertia")[i, j] for i, j in PAIRS]),
         _with_inertia,
         unit="kg m^2",
-        checked=_check_inertia,
-        check_with=lambda given, parts: None if "mode_coupling" in given else _check_flexible_body(given, parts),
+        validate=_check_inertia,
+        check_together=lambda table, parts: None if "mode_coupling" in table else _check_flexible_body(table, parts),
     ),
     DISTURBANCE_PHASE: _disturbance_quantity(DISTURBANCE_PHASE, "phase", unit="rad"),
     DISTURBANCE_AMPLITUDE: _disturbance_quantity(DISTURBANCE_AMPLITUDE, "amplitude", combine=scale_nominal, unit="N m"),
@@ -246,9 +246,9 @@ QUANTITIES: dict[str, Quantity] = {
     ),
     **{
         level_name(name): field_quantity(
-            path, f"{name}_", combine=scale_nominal, size=lambda parts: 1, unit=unit, checked=checked
+            path, f"{name}_", combine=scale_nominal, size=lambda parts: 1, unit=unit, validate=validate
         )
-        for name, path, unit, checked in (
+        for name, path, unit, validate in (
             ("attitude_noise", "sensors.attitude_noise", "rad", not_negative),
             ("rate_noise", "sensors.rate_noise", "rad/s", not_negative),
             ("state_noise", "sensors.sigma", "", not_negative),
@@ -269,8 +269,8 @@ QUANTITIES: dict[str, Quantity] = {
         _read_directions,
         lambda parts, directions: _with_actuators(parts, directions=directions.reshape(-1, 3).T),
         _rotate_channels,
-        checked=validator(
-            lambda rows: np.abs(np.linalg.norm(rows.reshape(len(rows), -1, 3), axis=2) - 1.0) <= NEAR,
+        validate=validator(
+            lambda rows: np.abs(np.linalg.norm(rows.reshape(len(rows), -1, 3), axis=2) - 1.0) <= NORM_TOLERANCE,
             "unit vectors, three numbers for each channel",
         ),
         hardware=True,
@@ -286,16 +286,16 @@ QUANTITIES: dict[str, Quantity] = {
         lambda parts: getattr(parts.sensors, "filter", None) is not None,
         combine=lambda random, nominal, parts: jnp.stack([random[0], random[0] + random[1]]),  # from begin and duration
         unit="s",
-        checked=validator(lambda rows: rows[:, 0] <= rows[:, 1], "a begin and an end that is not before it"),
+        validate=validator(lambda rows: rows[:, 0] <= rows[:, 1], "a begin and an end that is not before it"),
         hardware=True,
     ),
     "wheel_failure": Quantity(
         lambda parts: [] if parts.actuators.wheels is None else list(_FAILURE_COLUMNS),
-        _read_failure,
-        _with_failure,
-        _choose_wheel,
+        _read_wheel_failure,
+        _with_wheel_failure,
+        _random_wheel_failure,
         unit=("s", "-"),
-        check_with=_check_wheel,
+        check_together=_check_wheel_failure,
         categories=_FAILURE_COLUMNS[1:],
         hardware=True,
     ),
@@ -305,14 +305,14 @@ QUANTITIES: dict[str, Quantity] = {
         0.0,
         lambda parts: parts.clock.sampled,
         combine=replace_nominal,
-        checked=validator(
+        validate=validator(
             lambda rows: (rows >= 0.0) & (rows < 0.5), "a fraction of the control period from 0 to below 0.5"
         ),
-        check_with=_check_jitter,
+        check_together=_check_jitter,
         hardware=True,
     ),
     "mode_frequency": field_quantity(
-        "plant.frequency", "mode_frequency_", combine=scale_nominal, unit="rad/s", checked=positive, hardware=True
+        "plant.frequency", "mode_frequency_", combine=scale_nominal, unit="rad/s", validate=positive, hardware=True
     ),
     "mode_coupling": Quantity(
         lambda parts: _vector_columns("mode_coupling", _count_modes(parts)),
@@ -323,7 +323,7 @@ QUANTITIES: dict[str, Quantity] = {
         scale_nominal,
         _count_modes,
         unit="sqrt(kg) m",
-        check_with=_check_flexible_body,
+        check_together=_check_flexible_body,
         hardware=True,
     ),
 }
@@ -349,10 +349,10 @@ def units(parts: Parts) -> dict[str, str]:
 
     A unit is empty if the plant has units of its own.
     """
-    named = {"initial_angle": parts.controller.kinematics.angle_unit}
+    unit_of = {"initial_angle": parts.controller.kinematics.angle_unit}
     for quantity in QUANTITIES.values():
         columns, unit = quantity.columns(parts), quantity.unit
-        each = (unit,) * len(columns) if isinstance(unit, str) else unit[: len(columns)]
-        known = [one if parts.plant.input_unit or one in ("rad", "s", "-") else "" for one in each]
-        named |= dict(zip(columns, known, strict=True))
-    return named
+        column_units = (unit,) * len(columns) if isinstance(unit, str) else unit[: len(columns)]
+        known_units = [name if parts.plant.input_unit or name in ("rad", "s", "-") else "" for name in column_units]
+        unit_of |= dict(zip(columns, known_units, strict=True))
+    return unit_of

@@ -1,6 +1,6 @@
-"""Trials of a run table: the quantities of its columns have given values, and all others are random.
+"""Trials of a run table. Quantities with a column have the values of the table; all others are random.
 
-`about` combines a row of the table with the dispersion of the campaign.
+`trial_setup` combines a row of the table with the dispersion of the campaign.
 """
 
 from typing import Any, NamedTuple
@@ -12,7 +12,7 @@ from ptsmc_jax.simulation.rollout import Parts
 
 TRIAL, SEED = "trial", "seed"  # columns of a run table that select the random numbers of a row
 # names of these columns in result files, where `trial` is the number of the row
-OF_ROWS = {TRIAL: "run_trial", SEED: "run_seed"}
+RESULT_COLUMNS = {TRIAL: "run_trial", SEED: "run_seed"}
 
 
 class Row(NamedTuple):
@@ -23,7 +23,7 @@ class Row(NamedTuple):
     given: dict[str, Any]  # given values (n,) by the name of the quantity, see `QUANTITIES`
 
 
-class About(NamedTuple):
+class TrialSetup(NamedTuple):
     """Everything that determines the parts of a trial."""
 
     parts: Parts  # nominal parts, with the given values of the row
@@ -33,15 +33,15 @@ class About(NamedTuple):
     given: tuple[str, ...]  # names of the quantities with given values
 
     @property
-    def drawn(self) -> Parts:
+    def dispersed_parts(self) -> Parts:
         """Parts of the trial, with random and given values."""
         return self.dispersion.apply(self.parts, self.seed, self.trial)
 
 
-def about(parts: Parts, dispersion: Dispersion, seed: WholeNumber, trial: WholeNumber | Row) -> About:
+def trial_setup(parts: Parts, dispersion: Dispersion, seed: WholeNumber, trial: WholeNumber | Row) -> TrialSetup:
     """Write the given values of a row into the parts, and remove these quantities from the dispersion.
 
-    Each quantity has its own random stream. So the random quantities do not depend on the given ones.
+    Each quantity has its own random stream. Therefore the given values do not change the random quantities.
 
     Args:
         parts: nominal parts.
@@ -50,7 +50,7 @@ def about(parts: Parts, dispersion: Dispersion, seed: WholeNumber, trial: WholeN
         trial: number of the trial [-], or a row of a run table with values in SI units.
     """
     if not isinstance(trial, Row):
-        return About(parts, dispersion, seed, trial, ())
+        return TrialSetup(parts, dispersion, seed, trial, ())
     for name, numbers in trial.given.items():
         parts = QUANTITIES[name].write(parts, numbers)
-    return About(parts, dispersion.without(trial.given), trial.seed, trial.trial, tuple(trial.given))
+    return TrialSetup(parts, dispersion.without(trial.given), trial.seed, trial.trial, tuple(trial.given))

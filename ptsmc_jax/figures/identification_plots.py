@@ -20,7 +20,7 @@ def identification_figures(identification: Identification) -> dict[str, Figure]:
     figures: dict[str, Figure] = {"estimates": estimates(identification.table())}
     for k, fit in enumerate([*identification.fits, *identification.validation]):
         suffix = "" if k == 0 else f"_{k + 1}"
-        names, t = results.components(fit), fit.log.t[1:]
+        names, t = results.component_names(fit), fit.log.t[1:]
         values, sigma = results.innovations(fit)
         labels = [style.with_unit(name, UNITS.get(name.split("_")[0], "")) for name in names]
         figures[f"innovations{suffix}"] = innovations(t, labels, values, sigma)

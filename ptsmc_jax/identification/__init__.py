@@ -1,1 +1,1 @@
-"""Estimate the parameters of a scenario's true plant from telemetry. Start with `estimation.of_logs`."""
+"""Estimate the parameters of a scenario's true plant from telemetry. Start with `estimation.estimate_parameters`."""

@@ -22,7 +22,7 @@ from ptsmc_jax.scenario.tables import Scenario
 
 HALF_WAVES = (1, 2, 3, 4, 6, 8)  # numbers of half waves of the sines in the manoeuvre
 CANDIDATES, REFINEMENTS = 24, 40  # random profiles, and changes of the best one
-RATE = 0.05  # default limit of the rate [rad/s]
+DEFAULT_RATE = 0.05  # default limit of the rate [rad/s]
 
 
 @dataclass(frozen=True)
@@ -32,14 +32,14 @@ class Design:
     problem: Problem
     frame: pl.DataFrame  # t [s], sent1.. [N m] and the expected readings, with the columns of `trajectory.csv`
     std: np.ndarray  # expected 1 sigma of each number (k,)
-    plain: np.ndarray  # expected 1 sigma (k,) after one slew about each axis in turn, within the same limits
+    plain_std: np.ndarray  # expected 1 sigma (k,) after one slew about each axis in turn, within the same limits
     undetermined: list[str]
 
     def table(self) -> pl.DataFrame:
         """Return a row for each number: value, expected 1 sigma, 1 sigma after plain slews, unit."""
         numbers = self.problem.numbers(np.zeros(self.problem.size))
         return pl.DataFrame({
-            "parameter": self.problem.labels, "value": numbers, "expected_std": self.std, "plain_std": self.plain,
+            "parameter": self.problem.labels, "value": numbers, "expected_std": self.std, "plain_std": self.plain_std,
             "unit": self.problem.units,
         })  # fmt: skip
 
@@ -48,7 +48,7 @@ def design(
     what: Scenario | str | Any,
     duration: float = 300.0,
     *,
-    rate: float = RATE,
+    rate: float = DEFAULT_RATE,
     torque: float | None = None,
     report: Callable[[str], None] = lambda text: None,
 ) -> Design:
@@ -57,9 +57,9 @@ def design(
     Args:
         what: a scenario, or the path of its file. [identify] names the parameters, [hardware] the noises.
         duration: duration of the manoeuvre [s].
-        rate: largest rate about an axis, of other plants the largest velocity [rad/s].
+        rate: largest rate about an axis [rad/s]; for other plants, the largest velocity.
         torque: largest torque about an axis [N m]; by default the limit of the actuators.
-        report: called with the progress in words.
+        report: function that is called with a line of progress.
 
     Raises:
         ScenarioError: no limit of the torque is known, or the manoeuvre is shorter than 20 control periods.
@@ -70,52 +70,52 @@ def design(
         raise ScenarioError("a design needs the sampled loop and a manoeuvre of at least 20 control periods")
     t = period * np.arange(round(duration / period) + 1)
     shapes = np.stack([np.sin(np.pi * k * t / t[-1]) for k in HALF_WAVES])  # (waves, rows) for unit amplitudes
-    log = _silent(loaded, t)
+    log = _log_at_rest(loaded, t)
     problem = parameters.build(loaded, [log])
-    limits = _Limits.of(loaded, problem, rate, torque)
+    limits = _Limits.from_scenario(loaded, problem, rate, torque)
     search = Search(problem, [], np.inf, lambda text: None)
 
     def information(momentum: np.ndarray) -> tuple[np.ndarray, Measurements]:
         command = np.append(np.diff(momentum, axis=0) / period, np.zeros((1, momentum.shape[1])), axis=0)
-        expected = _expected(problem, search, log._replace(command=command))
-        return search.derivatives(np.zeros(problem.size), [estimation.prepared(problem, expected)])[2], expected
+        expected = _predict_readings(problem, search, log._replace(command=command))
+        return search.derivatives(np.zeros(problem.size), [estimation.prepare_log(problem, expected)])[2], expected
 
-    def value(momentum: np.ndarray) -> float:
-        sizes = np.linalg.eigvalsh(information(momentum)[0])
-        return float(np.sum(np.log(np.maximum(sizes, 1e-12))))
+    def log_determinant(momentum: np.ndarray) -> float:
+        eigenvalues = np.linalg.eigvalsh(information(momentum)[0])
+        return float(np.sum(np.log(np.maximum(eigenvalues, 1e-12))))
 
     inputs = log.command.shape[1]
-    plain = limits.scaled(_one_after_another(t, inputs), period)
-    best, amplitudes = value(plain), None
-    chosen, random = plain, np.random.default_rng(0)
+    plain_momentum = limits.scale_momentum(_slew_each_axis(t, inputs), period)
+    best, amplitudes = log_determinant(plain_momentum), None
+    chosen, random = plain_momentum, np.random.default_rng(0)
     for k in range(CANDIDATES + REFINEMENTS):
         if amplitudes is None or k < CANDIDATES:
-            new = random.standard_normal((inputs, len(HALF_WAVES)))
+            candidate = random.standard_normal((inputs, len(HALF_WAVES)))
         else:
-            new = amplitudes + 0.5 * np.std(amplitudes) * random.standard_normal(amplitudes.shape)
-        momentum = limits.scaled((new @ shapes).T, period)
-        found = value(momentum)
-        if found > best:
-            best, amplitudes, chosen = found, new, momentum
+            candidate = amplitudes + 0.5 * np.std(amplitudes) * random.standard_normal(amplitudes.shape)
+        momentum = limits.scale_momentum((candidate @ shapes).T, period)
+        value = log_determinant(momentum)
+        if value > best:
+            best, amplitudes, chosen = value, candidate, momentum
         report(f"profile {k + 1} of {CANDIDATES + REFINEMENTS}: log det of the information {best:.5g}")
     by_z = problem.derivatives(np.zeros(problem.size))
 
-    def std(information: np.ndarray) -> np.ndarray:
+    def number_std(information: np.ndarray) -> np.ndarray:
         return np.sqrt(np.diag(by_z @ estimation.covariance(information) @ by_z.T))
 
-    of_best, expected = information(chosen)
+    best_information, expected = information(chosen)
     return Design(
         problem,
-        _frame(expected),
-        std(of_best),
-        std(information(plain)[0]),
-        estimation.undetermined(problem, of_best, by_z),
+        _to_frame(expected),
+        number_std(best_information),
+        number_std(information(plain_momentum)[0]),
+        estimation.describe_undetermined(problem, best_information, by_z),
     )
 
 
 @dataclass(frozen=True)
 class _Limits:
-    """Limits of rate, torque and momentum that a manoeuvre must keep, and the maps to compute them."""
+    """Limits of a manoeuvre's rate, torque and wheel momentum, and the maps from body momentum to rate and wheels."""
 
     torque: float  # largest torque about an axis [N m]
     rate: float  # largest rate about an axis [rad/s]
@@ -124,10 +124,10 @@ class _Limits:
     momentum: float  # largest momentum of each wheel [N m s], infinite without a limit
 
     @staticmethod
-    def of(loaded: Any, problem: Problem, rate: float, torque: float | None) -> "_Limits":
+    def from_scenario(loaded: Any, problem: Problem, rate: float, torque: float | None) -> "_Limits":
         wheels = loaded.reaction_wheels
         limits = [torque, loaded.devices.torque_limit, None if wheels is None else wheels.torque_limit]
-        known = [one for one in limits if one is not None]
+        known = [limit for limit in limits if limit is not None]
         if not known:
             raise ScenarioError(
                 "hardware.torque_limit is absent, but a design needs the largest torque; allowed is --torque too"
@@ -137,57 +137,57 @@ class _Limits:
         momentum = np.inf if wheels is None or wheels.momentum_limit is None else wheels.momentum_limit
         return _Limits(min(known), rate, np.asarray(plant.inertia_inverse), channels, momentum)
 
-    def scaled(self, momentum: np.ndarray, period: float) -> np.ndarray:
-        """Return a momentum profile (rows, m) with a factor that makes it meet all limits with 5 % to spare."""
-        stored, push = momentum @ self.allocation.T, np.diff(momentum, axis=0) / period
-        largest = [
-            np.max(np.abs(push)) / self.torque,
-            np.max(np.abs(push @ self.allocation.T)) / self.torque,
+    def scale_momentum(self, momentum: np.ndarray, period: float) -> np.ndarray:
+        """Return a momentum profile (rows, m) that is scaled to 95 % of the tightest limit."""
+        wheel_momentum, torque = momentum @ self.allocation.T, np.diff(momentum, axis=0) / period
+        ratios = [
+            np.max(np.abs(torque)) / self.torque,
+            np.max(np.abs(torque @ self.allocation.T)) / self.torque,
             np.max(np.abs(momentum @ self.inertia_inverse.T)) / self.rate,
-            np.max(np.abs(stored)) / self.momentum,
+            np.max(np.abs(wheel_momentum)) / self.momentum,
         ]
-        return momentum * (0.95 / max(largest))
+        return momentum * (0.95 / max(ratios))
 
 
-def _one_after_another(t: np.ndarray, inputs: int) -> np.ndarray:
+def _slew_each_axis(t: np.ndarray, inputs: int) -> np.ndarray:
     """Return the momentum of one slew about each axis, one after another."""
-    length = t[-1] / inputs
+    slew_time = t[-1] / inputs
     momentum = np.zeros((len(t), inputs))
     for k in range(inputs):
-        within = (t >= k * length) & (t < (k + 1) * length)
-        momentum[within, k] = np.sin(np.pi * (t[within] - k * length) / length) ** 2
+        is_slew = (t >= k * slew_time) & (t < (k + 1) * slew_time)
+        momentum[is_slew, k] = np.sin(np.pi * (t[is_slew] - k * slew_time) / slew_time) ** 2
     return momentum
 
 
-def _silent(loaded: Any, t: np.ndarray) -> Measurements:
-    """Return a synthetic log: a plant at rest without commands, read at the sample times of the scenario's sensors."""
+def _log_at_rest(loaded: Any, t: np.ndarray) -> Measurements:
+    """Return a synthetic log of a plant at rest, with readings at the sample times of the scenario's sensors."""
     if loaded.plant.kind != "spacecraft":
         x = np.tile(np.asarray(loaded.plant.x0, float), (len(t), 1))
         return Measurements("design", t, {"x": x}, np.zeros((len(t), loaded.inputs)))
     q = np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))
-    every = max(1, round(loaded.devices.interval(loaded.loop.period) / loaded.loop.period))
-    q[np.arange(len(t)) % every != 0] = np.nan
+    reading_interval = max(1, round(loaded.devices.interval(loaded.loop.period) / loaded.loop.period))
+    q[np.arange(len(t)) % reading_interval != 0] = np.nan
     return Measurements("design", t, {"attitude": q, "rate": np.zeros((len(t), 3))}, np.zeros((len(t), 3)))
 
 
-def _expected(problem: Problem, search: Search, log: Measurements) -> Measurements:
+def _predict_readings(problem: Problem, search: Search, log: Measurements) -> Measurements:
     """Return the log with the readings that the model predicts without noise."""
-    rows, kind = estimation.prepared(problem, log)
-    blind = rows._replace(valid=np.concatenate([rows.valid[:1], np.zeros_like(rows.valid[1:])]))
-    _, track = search.filtered(np.zeros(problem.size), (blind, kind))
-    sampled = rows.source[1:] >= 0
+    rows, kind = estimation.prepare_log(problem, log)
+    without_readings = rows._replace(valid=np.concatenate([rows.valid[:1], np.zeros_like(rows.valid[1:])]))
+    _, track = search.run_filter(np.zeros(problem.size), (without_readings, kind))
+    sampled = rows.log_row[1:] >= 0
     x = jax.tree.map(lambda v: v[sampled], track.x)
     readings = dict(log.readings)
     if "x" in readings:
         readings["x"] = np.concatenate([readings["x"][:1], np.asarray(jax.vmap(problem.model.plant.visible)(x))])
     else:
-        there = ~np.isnan(readings["attitude"][:, :1])
+        has_attitude = ~np.isnan(readings["attitude"][:, :1])
         q = np.concatenate([readings["attitude"][:1], x.q])
-        readings = {"attitude": np.where(there, q, np.nan), "rate": np.concatenate([readings["rate"][:1], x.w])}
+        readings = {"attitude": np.where(has_attitude, q, np.nan), "rate": np.concatenate([readings["rate"][:1], x.w])}
     return log._replace(readings=readings)
 
 
-def _frame(log: Measurements) -> pl.DataFrame:
+def _to_frame(log: Measurements) -> pl.DataFrame:
     columns = {"t": log.t}
     blocks = {"attitude": "measured_q", "rate": "measured_w", "x": "measured_x"}
     for name, values in (*log.readings.items(), ("sent", log.command)):

@@ -1,4 +1,4 @@
-"""Maximum-likelihood estimates of the free parameters of a scenario from telemetry. Start with `identify`.
+"""Maximum-likelihood estimates of the free parameters of a scenario from telemetry. Start with `estimate_parameters`.
 
 The likelihood is that of the innovations of the filter. Fisher scoring finds its maximum, with the step control of
 Levenberg and Marquardt. Each step solves (I + damping) step = gradient. The gradient is exact, and I is the Fisher
@@ -20,28 +20,28 @@ from scipy import stats
 from ptsmc_jax import configure
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.identification import filtering, parameters
-from ptsmc_jax.identification.filtering import Innovations, Kind, Model, Rows, Track
+from ptsmc_jax.identification.filtering import Innovations, LogKind, Model, Rows, Track
 from ptsmc_jax.identification.parameters import Problem
 from ptsmc_jax.identification.telemetry import Measurements
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
 
-BUCKET = 256  # rows of a log are padded to a multiple of it, so that similar logs share compiled programs
-STEPS = 40  # largest number of steps of a local search
-LONGEST_STEP = 3.0  # longest step of a local search, in sigmas of the prior
-CONVERGED_WITH_NOISE = 0.3  # largest step that ends a search with noise on the acceleration, in sigmas of the estimate
-CONVERGED = 1e-3  # largest step of a converged search, in sigmas of the estimate
-SLACK = (0.3, 0.03, 0.003, 0.0003)  # noise of the acceleration in a search, relative to the acceleration [s^0.5]
-SCREENINGS = 4  # largest number of times that outliers are determined again
+ROW_MULTIPLE = 256  # rows of a log are padded to a multiple of it, so that similar logs share compiled programs
+MAX_STEPS = 40  # largest number of steps of a local search
+MAX_STEP_LENGTH = 3.0  # longest step of a local search, in sigmas of the prior
+NOISY_TOLERANCE = 0.3  # largest step that ends a search with noise on the acceleration, in sigmas of the estimate
+STEP_TOLERANCE = 1e-3  # largest step of a converged search, in sigmas of the estimate
+ACCELERATION_NOISES = (0.3, 0.03, 0.003, 0.0003)  # noise in a search, relative to the acceleration [s^0.5]
+MAX_SCREENINGS = 4  # largest number of searches for outliers, each followed by a search for the parameters
 POOR_FIT = 1.5  # median normalised square of innovations above which a search begins with noise
 LAGS = 25  # number of lags of the autocorrelation
-WHITE = 0.05  # largest autocorrelation that counts as white in a long log
-CONSISTENT = (0.8, 1.25)  # mean normalised square of innovations that fit their variance, in a long log
-RARE = 4.0  # in a short log, an autocorrelation or a mean square beyond this number of sigmas is a misfit
-FARTHEST = 3.0  # distance of the most likely parameters of a validation log, RMS in sigmas of the estimates
-CONFIDENCE = 0.95
-CLEAR = 0.3  # smallest component of an undetermined direction that is named
-Prepared = tuple[Rows, Kind]  # a log for the filter
+MAX_AUTOCORRELATION = 0.05  # largest autocorrelation that counts as white in a long log
+MEAN_SQUARE_RANGE = (0.8, 1.25)  # mean normalised square of innovations that fit their variance, in a long log
+MISFIT_SIGMAS = 4.0  # in a short log, an autocorrelation or a mean square beyond this number of sigmas is a misfit
+MAX_DISTANCE = 3.0  # largest distance of the most likely parameters of a validation log, RMS in sigmas of the estimates
+CONFIDENCE = 0.95  # of the intervals of the estimates
+MIN_COMPONENT = 0.3  # smallest component of an undetermined direction whose parameter is named
+PreparedLog = tuple[Rows, LogKind]  # a log for the filter
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ class Fit:
     """Innovations of a log for estimated parameters.
 
     The estimates have errors that change the predictions of a validation log. `adjusted` are its innovations for the
-    most likely parameters within the uncertainty of the estimates, and `moved` is their distance from the estimates.
+    most likely parameters within the uncertainty of the estimates, and `distance` is their distance from the estimates.
     """
 
     log: Measurements
@@ -57,28 +57,28 @@ class Fit:
     innovations: Innovations  # arrays (rows - 1, components)
     track: Track
     adjusted: Innovations | None = None
-    moved: float = 0.0  # distance of the most likely parameters from the estimates, RMS in sigmas
+    distance: float = 0.0  # distance of the most likely parameters from the estimates, RMS in sigmas
 
     @property
     def whitened(self) -> np.ndarray:
-        """`adjusted` innovations, if available, divided by their 1 sigma (samples, components) [-]; NaN: no reading."""
+        """Innovations over their 1 sigma, (samples, components) [-], NaN without a reading; `adjusted` if given."""
         value, variance, accepted = self.innovations if self.adjusted is None else self.adjusted
-        sampled = self.rows.source[1:] >= 0
+        sampled = self.rows.log_row[1:] >= 0
         return np.where(accepted, value / np.sqrt(variance), np.nan)[sampled]
 
     @property
-    def square(self) -> float:
+    def mean_square(self) -> float:
         """Mean square of the whitened innovations [-]; 1 if they fit their variance."""
         return float(np.nanmean(self.whitened**2))
 
     @property
-    def outliers(self) -> int:
-        """The number of rejected components."""
+    def outlier_count(self) -> int:
+        """Number of readings that are rejected as outliers, each component counted."""
         return int(np.sum(self.rows.valid[1:] & ~self.innovations.accepted))
 
     @property
-    def samples(self) -> int:
-        """The number of accepted components."""
+    def reading_count(self) -> int:
+        """Number of readings that are used, each component counted."""
         return int(np.sum(self.innovations.accepted))
 
     def autocorrelation(self) -> np.ndarray:
@@ -86,22 +86,23 @@ class Fit:
 
         Lags are counted in readings of the component.
         """
-        return np.stack([_autocorrelation(column[np.isfinite(column)]) for column in self.whitened.T], axis=1)
+        return np.stack([_autocorrelate(column[np.isfinite(column)]) for column in self.whitened.T], axis=1)
 
     @property
-    def white(self) -> bool:
+    def is_white(self) -> bool:
         """Whether the innovations fit their variance and are uncorrelated in time.
 
-        A correct model fails in about 1 % of logs, since the LAGS autocorrelations of each component are compared.
+        About 1 % of logs fail even with a correct model, because LAGS autocorrelations of each component are tested.
         """
         readings = np.maximum(np.sum(np.isfinite(self.whitened), axis=0), 1)
-        bound = np.maximum(WHITE, RARE / np.sqrt(readings))
-        spread = RARE * np.sqrt(2.0 / np.sum(readings))  # of the mean square of normal random numbers
-        consistent = min(CONSISTENT[0], 1.0 - spread) < self.square < max(CONSISTENT[1], 1.0 + spread)
-        return consistent and self.moved < FARTHEST and bool(np.all(np.abs(self.autocorrelation()) < bound))
+        bound = np.maximum(MAX_AUTOCORRELATION, MISFIT_SIGMAS / np.sqrt(readings))
+        spread = MISFIT_SIGMAS * np.sqrt(2.0 / np.sum(readings))  # of the mean square of normal random numbers
+        low, high = MEAN_SQUARE_RANGE
+        is_consistent = min(low, 1.0 - spread) < self.mean_square < max(high, 1.0 + spread)
+        return is_consistent and self.distance < MAX_DISTANCE and bool(np.all(np.abs(self.autocorrelation()) < bound))
 
 
-def _autocorrelation(values: np.ndarray) -> np.ndarray:
+def _autocorrelate(values: np.ndarray) -> np.ndarray:
     if values.size <= LAGS:
         return np.zeros(LAGS)
     total = np.sum(values**2)
@@ -116,11 +117,11 @@ class Identification:
     problem: Problem
     z: np.ndarray  # estimated coordinates (n,)
     start: np.ndarray  # numbers of the scenario (k,)
-    prior: np.ndarray  # prior 1 sigma of the numbers (k,), infinite without prior knowledge
+    prior_std: np.ndarray  # prior 1 sigma of the numbers (k,), infinite without prior knowledge
     estimate: np.ndarray  # estimated numbers (k,), in their units
     covariance: np.ndarray  # covariance of the estimated numbers (k, k)
     undetermined: list[str]  # sentences on combinations that the data do not determine
-    complete: bool  # whether data and prior knowledge together determine every combination
+    is_determined: bool  # whether data and prior knowledge together determine every parameter
     fits: list[Fit]
     validation: list[Fit]
     converged: bool
@@ -133,35 +134,35 @@ class Identification:
         return np.sqrt(np.diag(self.covariance))
 
     @property
-    def white(self) -> bool:
+    def is_white(self) -> bool:
         """Whether the innovations of all logs are consistent and white."""
-        return all(fit.white for fit in [*self.fits, *self.validation])
+        return all(fit.is_white for fit in [*self.fits, *self.validation])
 
     @property
-    def good(self) -> bool:
+    def is_identified(self) -> bool:
         """Whether the model explains the logs, and data and prior knowledge determine every free parameter."""
-        return self.converged and self.white and self.complete
+        return self.converged and self.is_white and self.is_determined
 
     def table(self) -> pl.DataFrame:
         """Return a row for each number: estimate, 1 sigma, 95 % interval, start, prior 1 sigma and unit."""
-        problem, reach = self.problem, float(stats.norm.ppf(0.5 + CONFIDENCE / 2.0))
+        problem, half_width = self.problem, float(stats.norm.ppf(0.5 + CONFIDENCE / 2.0))
         return pl.DataFrame({
             "parameter": problem.labels, "estimate": self.estimate, "std": self.std,
-            "lower": self.estimate - reach * self.std, "upper": self.estimate + reach * self.std,
-            "start": self.start, "prior_std": self.prior, "unit": problem.units,
+            "lower": self.estimate - half_width * self.std, "upper": self.estimate + half_width * self.std,
+            "start": self.start, "prior_std": self.prior_std, "unit": problem.units,
         })  # fmt: skip
 
     def gyro_bias(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return the gyro bias at the end of each log and its 1 sigma, (3,) each [rad/s]."""
-        if not self.problem.bias:
+        if not self.problem.has_gyro_bias:
             return []
-        size = self.problem.model.walk.size if self.problem.model.walk is not None else 0
-        found = []
+        walk_size = self.problem.model.walk_density.size if self.problem.model.walk_density is not None else 0
+        biases = []
         for fit in self.fits:
-            p = np.diag(fit.track.covariance[-1])
-            at = len(p) - size - 3
-            found.append((fit.track.bias[-1], np.sqrt(p[at : at + 3])))
-        return found
+            variances = np.diag(fit.track.covariance[-1])
+            first = len(variances) - walk_size - 3
+            biases.append((fit.track.bias[-1], np.sqrt(variances[first : first + 3])))
+        return biases
 
     def __repr__(self) -> str:
         lines = [
@@ -171,105 +172,105 @@ class Identification:
         return "\n".join([*lines, *self.undetermined])
 
 
-def of_logs(
+def estimate_parameters(
     loaded: Scenario,
     logs: Sequence[Measurements],
-    others: Sequence[Measurements] = (),
+    validation_logs: Sequence[Measurements] = (),
     free: Sequence[str] | None = None,
     report: Callable[[str], None] = lambda text: None,
 ) -> Identification:
-    """Estimate parameters from logs that are already read.
+    """Estimate the free parameters of a scenario from logs.
 
     Args:
         loaded: a complete scenario.
         logs: the logs.
-        others: logs that are only predicted.
-        free: names of the parameters.
+        validation_logs: further logs, which are predicted but not used for the estimate.
+        free: names of the free parameters; by default those of [identify].
         report: called with the progress in words.
     """
-    _check_alike([*logs, *others])
+    _check_same_readings([*logs, *validation_logs])
     problem = parameters.build(loaded, logs, free)
-    search = Search(problem, [prepared(problem, one) for one in logs], _gate(loaded), report)
-    usual = max(parameters.acceleration(problem.model, log) for log in logs)
-    starts = 3 if loaded.identify is None else loaded.identify.starts
-    best = search.best(np.zeros(problem.size), usual, starts)
-    return _result(loaded, problem, search, best, logs, others)
+    search = Search(problem, [prepare_log(problem, log) for log in logs], _innovation_gate(loaded), report)
+    largest_acceleration = max(parameters.commanded_acceleration(problem.model, log) for log in logs)
+    max_starts = 3 if loaded.identify is None else loaded.identify.starts
+    best = search.find_best(np.zeros(problem.size), largest_acceleration, max_starts)
+    return _build_result(loaded, problem, search, best, logs, validation_logs)
 
 
-def _check_alike(logs: Sequence[Measurements]) -> None:
+def _check_same_readings(logs: Sequence[Measurements]) -> None:
     """Raise ScenarioError if logs have different readings or commands."""
     first = logs[0]
     for log in logs[1:]:
-        same = (set(log.readings), log.by_channel, log.wheel_inertia) == (
+        is_same = (set(log.readings), log.by_channel, log.wheel_inertia) == (
             set(first.readings), first.by_channel, first.wheel_inertia
         )  # fmt: skip
-        if not same:
+        if not is_same:
             raise ScenarioError(f"{log.name} has other readings than {first.name}, but all logs must have the same")
 
 
-def prepared(problem: Problem, log: Measurements) -> Prepared:
+def prepare_log(problem: Problem, log: Measurements) -> PreparedLog:
     """Return the rows of a log for the filter, and their structure."""
-    return filtering.rows_of(log, problem.step, BUCKET), Kind.of(log)
+    return filtering.make_rows(log, problem.max_step, ROW_MULTIPLE), LogKind.from_log(log)
 
 
-def _gate(loaded: Scenario) -> float:
+def _innovation_gate(loaded: Scenario) -> float:
     """Return the largest accepted mean normalised square of the innovations of a group of readings [-]."""
     rate = 1e-6 if loaded.identify is None else loaded.identify.outliers
     return float(stats.chi2.isf(rate, 3) / 3.0) if rate > 0.0 else np.inf
 
 
-class Found(NamedTuple):
+class SearchResult(NamedTuple):
     """Result of a local search."""
 
     z: np.ndarray
-    value: float  # log-likelihood with the prior
+    log_likelihood: float  # with the prior
     information: np.ndarray
-    square: float
+    mean_square: float  # of the innovations, relative to their variance
     converged: bool
     steps: int
 
 
 class Search:
-    """Local searches for the estimates from some logs; programs are compiled once for logs of the same length."""
+    """Local searches for the most likely parameters of some logs. Logs of the same length share compiled programs."""
 
-    def __init__(self, problem: Problem, logs: Sequence[Prepared], gate: float, report: Callable[[str], None]):
-        """Args: the problem, the logs, the normalised square of outliers, and a function that reports progress."""
+    def __init__(self, problem: Problem, logs: Sequence[PreparedLog], gate: float, report: Callable[[str], None]):
+        """Args: problem, logs, mean normalised square above which readings are outliers, and progress function."""
         self.problem, self.logs, self.gate, self.report = problem, list(logs), gate, report
-        self.known = problem.known().astype(float)
-        self._noise_is_free = any(one.name.endswith("_noise") for one in problem.parameters)
-        self.slack = jnp.zeros(())
-        self._filter = jax.jit(self._filtered, static_argnames="kind")
-        self._errors = jax.jit(self._innovations, static_argnames="kind")
-        self._derivatives = jax.jit(self._differentiated, static_argnames=("kind", "exact"))
+        self.prior_weight = problem.has_prior().astype(float)
+        self._noise_is_free = any(parameter.name.endswith("_noise") for parameter in problem.parameters)
+        self.acceleration_noise = jnp.zeros(())
+        self._jitted_filter = jax.jit(self._run_filter, static_argnames="kind")
+        self._jitted_innovations = jax.jit(self._innovations, static_argnames="kind")
+        self._jitted_derivatives = jax.jit(self._differentiate, static_argnames=("kind", "exact"))
 
-    def _at(self, z: Array, slack: Array) -> Model:
-        return replace(self.problem.at(z), slack=slack)
+    def _model_at(self, z: Array, noise: Array) -> Model:
+        return replace(self.problem.model_at(z), acceleration_noise=noise)
 
-    def _filtered(self, z: Array, rows: Rows, kind: Kind) -> tuple[Innovations, Any]:
-        return filtering.filtered(self.problem.at(z), rows, kind)
+    def _run_filter(self, z: Array, rows: Rows, kind: LogKind) -> tuple[Innovations, Any]:
+        return filtering.run_filter(self.problem.model_at(z), rows, kind)
 
-    def _innovations(self, z: Array, slack: Array, rows: Rows, gate: Any, kind: Kind) -> Innovations:
-        return filtering.innovations(self._at(z, slack), rows, kind, gate)
+    def _innovations(self, z: Array, noise: Array, rows: Rows, gate: Any, kind: LogKind) -> Innovations:
+        return filtering.innovations(self._model_at(z, noise), rows, kind, gate)
 
-    def _differentiated(
-        self, z: Array, slack: Array, rows: Rows, kind: Kind, exact: bool
+    def _differentiate(
+        self, z: Array, noise: Array, rows: Rows, kind: LogKind, exact: bool
     ) -> tuple[Array, Array, Array, Array]:
         """Return log-likelihood, gradient, Fisher information and mean normalised square of one log."""
 
-        def of(z: Array) -> tuple[tuple[Array, Array], Innovations]:
-            found = filtering.innovations(self._at(z, slack), rows, kind, covariance_derivatives=exact)
-            return (found.value, found.variance), found
+        def innovations_at(z: Array) -> tuple[tuple[Array, Array], Innovations]:
+            innovations = filtering.innovations(self._model_at(z, noise), rows, kind, covariance_derivatives=exact)
+            return (innovations.value, innovations.variance), innovations
 
-        def along(directions: Array) -> Any:  # derivatives that one device computes
-            one = jax.vmap(lambda d: jax.jvp(of, (z,), (d,), has_aux=True)[1:], out_axes=(-1, None))(directions[0])
-            return jax.tree.map(lambda v: v[None], one)
+        def differentiate_along(directions: Array) -> Any:  # the part of one device
+            derive = jax.vmap(lambda d: jax.jvp(innovations_at, (z,), (d,), has_aux=True)[1:], out_axes=(-1, None))
+            return jax.tree.map(lambda v: v[None], derive(directions[0]))
 
         devices = min(len(configure.devices()), z.size)
-        each = -(-z.size // devices)  # number of directions that each device computes
-        directions = jnp.eye(devices * each, z.size).reshape(devices, each, z.size)
-        slopes, found = montecarlo.map_over_devices(along, directions, devices)
-        by_value, by_variance = (jnp.concatenate([*v], axis=-1)[..., : z.size] for v in slopes)
-        value, variance, accepted = (v[0] for v in found)
+        per_device = -(-z.size // devices)  # number of directions of each device
+        directions = jnp.eye(devices * per_device, z.size).reshape(devices, per_device, z.size)
+        derivatives, innovations = montecarlo.map_over_devices(differentiate_along, directions, devices)
+        by_value, by_variance = (jnp.concatenate([*v], axis=-1)[..., : z.size] for v in derivatives)
+        value, variance, accepted = (v[0] for v in innovations)
         by_value = by_value / jnp.sqrt(variance)[..., None]
         by_variance = by_variance / variance[..., None]
         whitened = value / jnp.sqrt(variance)
@@ -280,18 +281,20 @@ class Search:
         count = jnp.maximum(jnp.sum(accepted), 1)
         return _log_likelihood(value, variance, accepted), gradient, information, jnp.sum(whitened**2) / count
 
-    def filtered(self, z: np.ndarray, log: Prepared) -> tuple[Innovations, Track]:
+    def run_filter(self, z: np.ndarray, log: PreparedLog) -> tuple[Innovations, Track]:
         """Return innovations and estimates of the filter for a log, as NumPy arrays."""
         rows, kind = log
-        return jax.tree.map(np.asarray, self._filter(jnp.asarray(z), _numbers(rows), kind=kind))
+        return jax.tree.map(np.asarray, self._jitted_filter(jnp.asarray(z), _to_jax(rows), kind=kind))
 
-    def innovations(self, z: np.ndarray, log: Prepared, gate: float = np.inf) -> Innovations:
+    def innovations(self, z: np.ndarray, log: PreparedLog, gate: float = np.inf) -> Innovations:
         """Return the innovations of a log, as NumPy arrays."""
         rows, kind = log
-        return jax.tree.map(np.asarray, self._errors(jnp.asarray(z), self.slack, _numbers(rows), gate, kind=kind))
+        noise = self.acceleration_noise
+        computed = self._jitted_innovations(jnp.asarray(z), noise, _to_jax(rows), gate, kind=kind)
+        return jax.tree.map(np.asarray, computed)
 
     def derivatives(
-        self, z: np.ndarray, logs: Sequence[Prepared], *, exact: bool = True
+        self, z: np.ndarray, logs: Sequence[PreparedLog], *, exact: bool = True
     ) -> tuple[float, np.ndarray, np.ndarray, float]:
         """Return the log-likelihood of logs and prior, its derivatives, and the fit of the logs.
 
@@ -299,38 +302,39 @@ class Search:
             z: coordinates (n,) [-].
             logs: the logs.
             exact: whether gradient and information include the derivatives of the predicted covariance. Without them
-                they take half of the time, and are good enough for a first search if no noise level is free.
+                they take half of the time, and are accurate enough for a first search if no noise level is free.
 
         Returns:
             Log-likelihood, its gradient (n,), and the information (n, n) of logs and prior. Then the mean square of the
             innovations relative to their 1 sigma, averaged over the logs.
         """
-        value, gradient, information = -0.5 * float(self.known @ z**2), -self.known * z, np.diag(self.known)
-        squares = []
+        weight, noise, squares = self.prior_weight, self.acceleration_noise, []
+        value, gradient, information = -0.5 * float(weight @ z**2), -weight * z, np.diag(weight)
         for rows, kind in logs:
-            one = jax.tree.map(np.asarray, self._derivatives(jnp.asarray(z), self.slack, _numbers(rows), kind, exact))
-            value, gradient, information = value + float(one[0]), gradient + one[1], information + one[2]
-            squares.append(float(one[3]))
+            terms = self._jitted_derivatives(jnp.asarray(z), noise, _to_jax(rows), kind, exact)
+            terms = jax.tree.map(np.asarray, terms)
+            value, gradient, information = value + float(terms[0]), gradient + terms[1], information + terms[2]
+            squares.append(float(terms[3]))
         return value, gradient, information, float(np.mean(squares))
 
-    def best(self, z: np.ndarray, acceleration: float, starts: int) -> Found:
+    def find_best(self, z: np.ndarray, acceleration: float, max_starts: int) -> SearchResult:
         """Return the best of the local searches from z and, while the fit is poor, from random starting points.
 
         Args:
             z: first starting point (n,).
-            acceleration: see `run`.
-            starts: largest number of starting points.
+            acceleration: see `search_locally`.
+            max_starts: largest number of starting points.
         """
-        best, draws = self.run(z, acceleration), np.random.default_rng(0)
-        for k in range(1, starts):
-            if best.square < CONSISTENT[1]:
+        best, draws = self.search_locally(z, acceleration), np.random.default_rng(0)
+        for k in range(1, max_starts):
+            if best.mean_square < MEAN_SQUARE_RANGE[1]:
                 break
             self.report(f"the fit is poor; starting point {k + 1}")
-            other = self.run(draws.standard_normal(self.problem.size), acceleration)
-            best = max(best, other, key=lambda found: found.value)
+            other = self.search_locally(draws.standard_normal(self.problem.size), acceleration)
+            best = max(best, other, key=lambda result: result.log_likelihood)
         return best
 
-    def run(self, z: np.ndarray, acceleration: float) -> Found:
+    def search_locally(self, z: np.ndarray, acceleration: float) -> SearchResult:
         """Return the result of the local search from coordinates (n,), with outliers rejected.
 
         A model that is far off predicts a long log badly, and its likelihood has many maxima. If the fit is poor, the
@@ -340,78 +344,78 @@ class Search:
             z: starting point.
             acceleration: usual acceleration in the logs [rad/s^2]; 0: no noise is added.
         """
-        if acceleration > 0.0 and max(self._scale(self.innovations(z, log)) for log in self.logs) > POOR_FIT:
-            for factor in SLACK:
-                self.slack = jnp.asarray(factor * acceleration)
-                self.report(f"the fit is poor: a filter with noise of {float(self.slack):.2g} rad/s^1.5")
-                z = self._run(z, 1, CONVERGED_WITH_NOISE).z
-            self.slack = jnp.zeros(())
-        return self._run(z, SCREENINGS, CONVERGED)
+        if acceleration > 0.0 and max(self._relative_median(self.innovations(z, log)) for log in self.logs) > POOR_FIT:
+            for factor in ACCELERATION_NOISES:
+                self.acceleration_noise = jnp.asarray(factor * acceleration)
+                self.report(f"the fit is poor: a filter with noise of {float(self.acceleration_noise):.2g} rad/s^1.5")
+                z = self._screen_and_maximise(z, 1, NOISY_TOLERANCE).z
+            self.acceleration_noise = jnp.zeros(())
+        return self._screen_and_maximise(z, MAX_SCREENINGS, STEP_TOLERANCE)
 
-    def _run(self, z: np.ndarray, screenings: int, enough: float) -> Found:
-        before, found = None, None
+    def _screen_and_maximise(self, z: np.ndarray, screenings: int, tolerance: float) -> SearchResult:
+        previous_masks, result = None, None
         for _ in range(screenings):
-            logs = [self.screened(z, log) for log in self.logs]
+            logs = [self.reject_outliers(z, log) for log in self.logs]
             masks = np.concatenate([log[0].valid.ravel() for log in logs])
-            if before is not None and np.array_equal(masks, before):
+            if previous_masks is not None and np.array_equal(masks, previous_masks):
                 break
-            before, found = masks, self.maximise(z, logs, enough)
-            z = found.z
-        assert found is not None
-        return found
+            previous_masks, result = masks, self.maximise_likelihood(z, logs, tolerance)
+            z = result.z
+        assert result is not None
+        return result
 
     @staticmethod
-    def _scale(found: Innovations) -> float:
-        """Return the median of the normalised squares of the innovations over the median of a good fit."""
-        squares = (found.value**2 / found.variance)[found.accepted]
+    def _relative_median(innovations: Innovations) -> float:
+        """Return the median of the normalised squares of the innovations relative to the median of a good fit."""
+        squares = (innovations.value**2 / innovations.variance)[innovations.accepted]
         return float(np.median(squares)) / float(stats.chi2.median(1))
 
-    def screened(self, z: np.ndarray, log: Prepared) -> Prepared:
+    def reject_outliers(self, z: np.ndarray, log: PreparedLog) -> PreparedLog:
         """Return the log without its outliers at these coordinates.
 
-        The limit is relative to the median of the squares, so that good samples stay while the model is still poor.
+        The limit is relative to the median of the squares, so that a poor model does not reject correct readings.
         """
         if not np.isfinite(self.gate):
             return log
         scale = 1.0
         for gate in (np.inf, self.gate):
-            found = self.innovations(z, log, gate * scale)
-            scale = max(scale, self._scale(found))
+            innovations = self.innovations(z, log, gate * scale)
+            scale = max(scale, self._relative_median(innovations))
         rows, kind = log
-        return rows._replace(valid=np.concatenate([rows.valid[:1], found.accepted])), kind
+        return rows._replace(valid=np.concatenate([rows.valid[:1], innovations.accepted])), kind
 
-    def maximise(self, z: np.ndarray, logs: Sequence[Prepared], enough: float) -> Found:
-        """Return the nearest maximum of the likelihood of these logs; it ends after a step below `enough` sigma."""
-        exact = enough <= CONVERGED or self._noise_is_free
-        value, gradient, information, square = here = self.derivatives(z, logs, exact=exact)
-        if not _finite(here):  # such as an inertia that is too small for the modes, after a random start
-            return Found(z, -np.inf, np.zeros_like(information), np.inf, False, 0)
+    def maximise_likelihood(self, z: np.ndarray, logs: Sequence[PreparedLog], tolerance: float) -> SearchResult:
+        """Return the nearest maximum of the likelihood of these logs; it ends after a step below `tolerance` sigma."""
+        exact = tolerance <= STEP_TOLERANCE or self._noise_is_free
+        value, gradient, information, mean_square = start = self.derivatives(z, logs, exact=exact)
+        if not _is_finite(start):  # such as an inertia that is too small for the modes, after a random start
+            return SearchResult(z, -np.inf, np.zeros_like(information), np.inf, False, 0)
         damping, converged, steps = 0.0, False, 0
-        for steps in range(1, STEPS + 1):
+        for steps in range(1, MAX_STEPS + 1):
             sizes, directions = np.linalg.eigh(information)
             directions = directions[:, sizes >= 1.0]  # other directions keep their prior
             sizes = sizes[sizes >= 1.0]
             while True:
                 step = directions @ ((directions.T @ gradient) / (sizes + damping))
-                step = step * min(1.0, LONGEST_STEP / max(float(np.linalg.norm(step)), 1e-300))
+                step = step * min(1.0, MAX_STEP_LENGTH / max(float(np.linalg.norm(step)), 1e-300))
                 size = float(np.sqrt(step @ information @ step))
-                there = self.derivatives(z + step, logs, exact=exact)
-                if _finite(there) and there[0] >= value - 1e-9 * abs(value):
+                candidate = self.derivatives(z + step, logs, exact=exact)
+                if _is_finite(candidate) and candidate[0] >= value - 1e-9 * abs(value):
                     break
                 damping = max(10.0 * damping, float(np.min(sizes, initial=1.0)))
                 if damping > 1e12:
-                    return Found(z, value, information, square, size < enough, steps)
+                    return SearchResult(z, value, information, mean_square, size < tolerance, steps)
             z, damping = z + step, damping / 100.0
-            value, gradient, information, square = there
-            self.report(f"step {steps}: mean square of the innovations {square:.4g}")
-            if size < enough:
+            value, gradient, information, mean_square = candidate
+            self.report(f"step {steps}: mean square of the innovations {mean_square:.4g}")
+            if size < tolerance:
                 converged = True
                 break
-        return Found(z, value, information, square, converged, steps)
+        return SearchResult(z, value, information, mean_square, converged, steps)
 
 
-def _finite(derivatives: tuple[float, np.ndarray, np.ndarray, float]) -> bool:
-    """Return whether a likelihood and its derivatives are numbers; the motion of an impossible body overflows."""
+def _is_finite(derivatives: tuple[float, np.ndarray, np.ndarray, float]) -> bool:
+    """Return whether a likelihood and its derivatives are finite. They overflow for a body that is not physical."""
     return all(bool(np.all(np.isfinite(one))) for one in derivatives)
 
 
@@ -420,9 +424,9 @@ def _log_likelihood(value: Any, variance: Any, accepted: Any) -> Any:
     return -0.5 * jnp.sum(jnp.where(accepted, value**2 / variance + jnp.log(variance), 0.0))
 
 
-def _numbers(rows: Rows) -> Rows:
-    """Return the rows as arrays for JAX; `source` is not used there."""
-    return jax.tree.map(jnp.asarray, rows._replace(source=np.zeros(0)))
+def _to_jax(rows: Rows) -> Rows:
+    """Return the rows as arrays for JAX; `log_row` is not used there."""
+    return jax.tree.map(jnp.asarray, rows._replace(log_row=np.zeros(0)))
 
 
 def covariance(information: np.ndarray) -> np.ndarray:
@@ -431,7 +435,7 @@ def covariance(information: np.ndarray) -> np.ndarray:
     return (directions / np.maximum(sizes, 1.0)) @ directions.T
 
 
-def undetermined(problem: Problem, information: np.ndarray, by_z: np.ndarray) -> list[str]:
+def describe_undetermined(problem: Problem, information: np.ndarray, by_z: np.ndarray) -> list[str]:
     """Return a sentence for each combination of parameters that the data do not determine.
 
     Args:
@@ -440,66 +444,73 @@ def undetermined(problem: Problem, information: np.ndarray, by_z: np.ndarray) ->
         by_z: derivatives of the numbers (k, n) by the coordinates.
     """
     sizes, directions = np.linalg.eigh(information)
-    usual, known, sentences = np.linalg.norm(by_z, axis=1), problem.known(), []
+    usual_change, has_prior, sentences = np.linalg.norm(by_z, axis=1), problem.has_prior(), []
     for direction in directions[:, sizes < 1.0].T:
-        change = (by_z @ direction) / np.where(usual > 0.0, usual, 1.0)
-        clear = np.abs(change) > CLEAR * np.max(np.abs(change))
-        names, common, at, row = [], [], 0, 0
-        for one in problem.parameters:
-            part, here = direction[at : at + one.size], clear[row : row + len(one.labels)]
-            at, row = at + one.size, row + len(one.labels)
-            if np.linalg.norm(part) < CLEAR:
+        change = (by_z @ direction) / np.where(usual_change > 0.0, usual_change, 1.0)
+        is_large = np.abs(change) > MIN_COMPONENT * np.max(np.abs(change))
+        names, common, coordinate, number = [], [], 0, 0
+        for parameter in problem.parameters:
+            part = direction[coordinate : coordinate + parameter.size]
+            is_label_large = is_large[number : number + len(parameter.labels)]
+            coordinate, number = coordinate + parameter.size, number + len(parameter.labels)
+            if np.linalg.norm(part) < MIN_COMPONENT:
                 continue
-            factor = one.common
-            alike = factor is not None and abs(part @ factor) > 0.9 * np.linalg.norm(part) * np.linalg.norm(factor)
-            common.append(one.name if alike else None)
-            names += [label for label, is_clear in zip(one.labels, here, strict=True) if is_clear]
-        kept = "the prior knowledge is kept" if np.all(known[np.abs(direction) > CLEAR]) else "the start is kept"
+            factor = parameter.common
+            is_factor = factor is not None and abs(part @ factor) > 0.9 * np.linalg.norm(part) * np.linalg.norm(factor)
+            common.append(parameter.name if is_factor else None)
+            names += [label for label, is_included in zip(parameter.labels, is_label_large, strict=True) if is_included]
+        is_prior_kept = np.all(has_prior[np.abs(direction) > MIN_COMPONENT])
+        kept_value = "the prior knowledge is kept" if is_prior_kept else "the start is kept"
         if len(common) == 2 and all(common):
             sentences.append(
-                f"the data determine only the ratio of {common[0]} to {common[1]}; {kept} for their product"
+                f"the data determine only the ratio of {common[0]} to {common[1]}; {kept_value} for their product"
             )
         elif len(names) == 1:
-            sentences.append(f"the data do not determine {names[0]}; {kept}")
+            sentences.append(f"the data do not determine {names[0]}; {kept_value}")
         else:
-            sentences.append(f"the data do not determine a combination of {', '.join(names)}; {kept}")
+            sentences.append(f"the data do not determine a combination of {', '.join(names)}; {kept_value}")
     return list(dict.fromkeys(sentences))
 
 
-def _result(
-    loaded: Scenario, problem: Problem, search: Search, best: Found, logs: Sequence[Any], others: Sequence[Any]
+def _build_result(
+    loaded: Scenario,
+    problem: Problem,
+    search: Search,
+    best: SearchResult,
+    logs: Sequence[Any],
+    validation_logs: Sequence[Any],
 ) -> Identification:
-    z, zero, known = best.z, np.zeros(problem.size), problem.known()
-    of_z, by_z, by_start = covariance(best.information), problem.derivatives(z), problem.derivatives(zero)
-    prior = np.sqrt(np.sum(by_start[:, known] ** 2, axis=1))
-    prior = np.where(np.any(by_start[:, ~known] != 0.0, axis=1) | (prior == 0.0), np.inf, prior)
+    z, zero, has_prior = best.z, np.zeros(problem.size), problem.has_prior()
+    z_covariance, by_z, by_start = covariance(best.information), problem.derivatives(z), problem.derivatives(zero)
+    prior_std = np.sqrt(np.sum(by_start[:, has_prior] ** 2, axis=1))
+    prior_std = np.where(np.any(by_start[:, ~has_prior] != 0.0, axis=1) | (prior_std == 0.0), np.inf, prior_std)
 
-    def fitted(log: Measurements) -> tuple[Fit, Prepared]:
-        one = prepared(problem, log)
-        good = search.screened(z, one)
-        return Fit(log, one[0], *search.filtered(z, good)), good
+    def fit_log(log: Measurements) -> tuple[Fit, PreparedLog]:
+        prepared = prepare_log(problem, log)
+        screened = search.reject_outliers(z, prepared)
+        return Fit(log, prepared[0], *search.run_filter(z, screened)), screened
 
-    def predicted(log: Measurements) -> Fit:
-        fit, good = fitted(log)
-        _, gradient, information, _ = search.derivatives(z, [good])
-        kept = np.linalg.pinv(of_z)  # information of the estimate, which includes the prior
-        step = np.linalg.solve(information - np.diag(search.known) + kept, gradient + search.known * z)
-        moved = float(np.sqrt(step @ kept @ step / step.size))
-        return replace(fit, adjusted=search.innovations(z + step, good), moved=moved)
+    def predict_log(log: Measurements) -> Fit:
+        fit, screened = fit_log(log)
+        _, gradient, information, _ = search.derivatives(z, [screened])
+        weight, prior_information = search.prior_weight, np.linalg.pinv(z_covariance)  # the estimate is the prior
+        step = np.linalg.solve(information - np.diag(weight) + prior_information, gradient + weight * z)
+        distance = float(np.sqrt(step @ prior_information @ step / step.size))
+        return replace(fit, adjusted=search.innovations(z + step, screened), distance=distance)
 
     return Identification(
         scenario=loaded,
         problem=problem,
         z=z,
         start=problem.numbers(zero),
-        prior=prior,
+        prior_std=prior_std,
         estimate=problem.numbers(z),
-        covariance=by_z @ of_z @ by_z.T,
-        undetermined=undetermined(problem, best.information - np.diag(search.known), by_start),
-        complete=bool(np.min(np.linalg.eigvalsh(best.information)) >= 1.0),
-        fits=[fitted(log)[0] for log in logs],
-        validation=[predicted(log) for log in others],
+        covariance=by_z @ z_covariance @ by_z.T,
+        undetermined=describe_undetermined(problem, best.information - np.diag(search.prior_weight), by_start),
+        is_determined=bool(np.min(np.linalg.eigvalsh(best.information)) >= 1.0),
+        fits=[fit_log(log)[0] for log in logs],
+        validation=[predict_log(log) for log in validation_logs],
         converged=best.converged,
         steps=best.steps,
-        log_likelihood=best.value,
+        log_likelihood=best.log_likelihood,
     )

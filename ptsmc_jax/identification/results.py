@@ -12,49 +12,54 @@ from ptsmc_jax.identification.estimation import LAGS, Fit, Identification
 from ptsmc_jax.scenario import parsing, reading
 from ptsmc_jax.scenario.tables import Scenario
 
-LARGEST_STD = 0.3  # largest 1 sigma of a relative dispersion in a scenario
+MAX_STD = 0.3  # largest 1 sigma of a relative dispersion in a scenario
 
 
-def identified(found: Identification) -> Scenario:
-    """Return the scenario with the estimates, whose [dispersion] has their covariance.
+def identified_scenario(identification: Identification) -> Scenario:
+    """Return the scenario with the estimated parameters, and with their covariance in [dispersion].
 
-    The design model of law and observer gets the estimated inertia. Correlations are kept inside the inertia only; each
-    other quantity gets the largest 1 sigma of its numbers. Parameters that no key of a scenario holds, such as the
-    numbers of a custom plant, are not in it.
+    The design model of law and observer gets the estimated inertia. Correlations are kept inside the inertia only. Each
+    other quantity gets the largest 1 sigma of its numbers. Parameters without a key in a scenario, such as the numbers
+    of a custom plant, are left out.
     """
-    tables, at = parsing.stated_tables(found.scenario), 0
+    tables, begin = parsing.stated_tables(identification.scenario), 0
     dispersion = dict(tables.get("dispersion", {}))
-    for one in found.problem.parameters:
-        block = slice(at, at + len(one.labels))
-        values, std = found.estimate[block], found.std[block]
-        at += len(one.labels)
-        _put(tables, dispersion, one.name, values, std, found)
+    for parameter in identification.problem.parameters:
+        block = slice(begin, begin + len(parameter.labels))
+        values, std = identification.estimate[block], identification.std[block]
+        begin += len(parameter.labels)
+        _write_estimate(tables, dispersion, parameter.name, values, std, identification)
     if dispersion:
         tables["dispersion"] = dispersion
     return reading.from_tables(tables, run=True)
 
 
-def _put(
-    tables: dict[str, Any], dispersion: dict[str, Any], name: str, values: np.ndarray, std: np.ndarray, found: Any
+def _write_estimate(
+    tables: dict[str, Any],
+    dispersion: dict[str, Any],
+    name: str,
+    values: np.ndarray,
+    std: np.ndarray,
+    identification: Any,
 ) -> None:
     """Write the estimate of one parameter into the tables, and its uncertainty into [dispersion]."""
     hardware = dict(tables.get("hardware", {}))
-    relative = _relative(std, values)
+    relative = _relative_dispersion(std, values)
     numbers = [float(value) for value in values]
     if name == "inertia":
         entries = dict(zip(PAIRS, numbers, strict=True))
         tensor = [[entries[min(i, j), max(i, j)] for j in range(3)] for i in range(3)]
         body = {key: value for key, value in tables.get("spacecraft", {}).items() if key != "true_inertia"}
         tables["spacecraft"] = {**body, "inertia": tensor}
-        dispersion["inertia"] = {"kind": "correlated", "factor": _inertia_factor(found, np.array(tensor))}
+        dispersion["inertia"] = {"kind": "correlated", "factor": _inertia_factor(identification, np.array(tensor))}
     elif name in ("actuator_scale", "gyro_scale"):
         hardware[name], dispersion[name] = numbers, relative
     elif name in ("actuator_misalignment", "star_tracker_misalignment"):
-        turns = _turns(found) if name == "actuator_misalignment" else values
-        hardware[f"{name}_deg"] = np.rad2deg(turns).tolist()
+        rotations = _misalignment_vectors(identification) if name == "actuator_misalignment" else values
+        hardware[f"{name}_deg"] = np.rad2deg(rotations).tolist()
         dispersion[name] = {"kind": "normal", "std_deg": float(np.rad2deg(np.max(std)))}
     elif name == "delay":
-        hardware["delay"] = round(numbers[0] / found.scenario.loop.period)
+        hardware["delay"] = round(numbers[0] / identification.scenario.loop.period)
     elif name in ("torque_lag", "attitude_noise", "rate_noise"):
         hardware[name] = numbers[0]
         if name == "rate_noise":
@@ -66,35 +71,35 @@ def _put(
         modes = np.array(numbers).reshape(-1, 3).tolist() if key == "coupling" else np.maximum(numbers, 0.0).tolist()
         tables["flexible"] = {**tables.get("flexible", {}), key: modes}
         if key != "damping":
-            size = values if key == "frequency" else np.repeat(np.linalg.norm(modes, axis=1), 3)
-            dispersion[name] = _relative(std, size)
+            sizes = values if key == "frequency" else np.repeat(np.linalg.norm(modes, axis=1), 3)
+            dispersion[name] = _relative_dispersion(std, sizes)
     elif name.startswith("disturbance_"):
-        _put_disturbance(tables, dispersion, name, numbers, std, relative)
+        _write_disturbance(tables, dispersion, name, numbers, std, relative)
     if hardware:
         tables["hardware"] = hardware
 
 
-def _relative(std: np.ndarray, values: np.ndarray) -> dict[str, Any]:
-    largest = min(np.max(std / np.abs(values), initial=0.0), LARGEST_STD)
+def _relative_dispersion(std: np.ndarray, values: np.ndarray) -> dict[str, Any]:
+    largest = min(np.max(std / np.abs(values), initial=0.0), MAX_STD)
     return {"kind": "relative_normal", "std": float(largest)}
 
 
-def _put_disturbance(
+def _write_disturbance(
     tables: dict[str, Any], dispersion: dict[str, Any], name: str, numbers: list[float], std: np.ndarray, relative: Any
 ) -> None:
-    """Write the estimate of a disturbance into its terms; an added constant becomes an additional term."""
+    """Write the estimate of a disturbance into the terms of its table; a bias becomes an additional term."""
     table = dict(tables.get("disturbance", {}))
     terms = [dict(term) for term in table.get("terms", [])] or [table]
     if name == "disturbance_bias":
         terms = [*(term for term in terms if term.get("kind") != "none"), {"kind": "constant", "amplitude": numbers}]
         dispersion[name] = {"kind": "normal", "std": float(np.max(std))}
     else:
-        key, at = name.removeprefix("disturbance_"), 0
+        key, begin = name.removeprefix("disturbance_"), 0
         for term in terms:
             if key in term:
                 size = len(term[key]) if isinstance(term[key], list) else 1
-                term[key] = numbers[at : at + size] if isinstance(term[key], list) else numbers[at]
-                at += size
+                term[key] = numbers[begin : begin + size] if isinstance(term[key], list) else numbers[begin]
+                begin += size
         if key == "amplitude":
             dispersion[name] = relative
         else:
@@ -102,67 +107,67 @@ def _put_disturbance(
     tables["disturbance"] = terms[0] if len(terms) == 1 else {"kind": "sum", "terms": terms}
 
 
-def _inertia_factor(found: Identification, tensor: np.ndarray) -> list[list[float]]:
+def _inertia_factor(identification: Identification, tensor: np.ndarray) -> list[list[float]]:
     """Return the rows of a lower triangular factor of the covariance of the inertia's log-Cholesky coordinates."""
-    at = found.problem.labels.index("inertia_11")
-    of_entries = found.covariance[at : at + 6, at : at + 6]
-    inverse = np.linalg.inv(parameters.by_coordinates(tensor))
-    sizes, directions = np.linalg.eigh(inverse @ of_entries @ inverse.T)
+    first = identification.problem.labels.index("inertia_11")
+    entry_covariance = identification.covariance[first : first + 6, first : first + 6]
+    inverse = np.linalg.inv(parameters.inertia_derivatives(tensor))
+    sizes, directions = np.linalg.eigh(inverse @ entry_covariance @ inverse.T)
     upper: Any = np.linalg.qr((directions * np.sqrt(np.maximum(sizes, 0.0))).T, mode="r")
     lower = upper.T * np.where(np.diag(upper) < 0.0, -1.0, 1.0)
     return [row[: k + 1].tolist() for k, row in enumerate(lower)]
 
 
-def _turns(found: Identification) -> np.ndarray:
+def _misalignment_vectors(identification: Identification) -> np.ndarray:
     """Return the rotation vector of each channel (channels, 3) [rad] from its axis in the design model."""
-    actuators = found.problem.at(jnp.asarray(found.z)).actuators
+    actuators = identification.problem.model_at(jnp.asarray(identification.z)).actuators
     axes = np.eye(3) if actuators.wheels is None else np.asarray(actuators.wheels.axes)
     cross = np.cross(axes.T, np.asarray(actuators.directions).T)
     sine = np.linalg.norm(cross, axis=1, keepdims=True)
     return cross * np.where(sine > 1e-12, np.arcsin(np.minimum(sine, 1.0)) / np.maximum(sine, 1e-12), 1.0)
 
 
-def summary(found: Identification) -> dict[str, Any]:
+def summary(identification: Identification) -> dict[str, Any]:
     """Return the content of `summary.json`."""
     return {
-        "status": "identified" if found.good else "doubtful",
-        "verdict": verdict(found),
-        "converged": found.converged,
-        "steps": found.steps,
-        "log_likelihood": found.log_likelihood,
+        "status": "identified" if identification.is_identified else "doubtful",
+        "verdict": verdict(identification),
+        "converged": identification.converged,
+        "steps": identification.steps,
+        "log_likelihood": identification.log_likelihood,
         "parameters": [
             {name: None if isinstance(v, float) and not np.isfinite(v) else v for name, v in row.items()}
-            for row in found.table().iter_rows(named=True)
+            for row in identification.table().iter_rows(named=True)
         ],
-        "undetermined": found.undetermined,
+        "undetermined": identification.undetermined,
         "gyro_bias": [
             {"log": fit.log.name, "estimate": bias.tolist(), "std": std.tolist()}
-            for fit, (bias, std) in zip(found.fits, found.gyro_bias(), strict=False)
+            for fit, (bias, std) in zip(identification.fits, identification.gyro_bias(), strict=False)
         ],
-        "logs": [_fit(fit) for fit in found.fits],
-        "validation": [_fit(fit) for fit in found.validation],
+        "logs": [_summarise_fit(fit) for fit in identification.fits],
+        "validation": [_summarise_fit(fit) for fit in identification.validation],
     }
 
 
-def _fit(fit: Fit) -> dict[str, Any]:
-    names = components(fit)
+def _summarise_fit(fit: Fit) -> dict[str, Any]:
+    names = component_names(fit)
     rms = np.sqrt(np.nanmean(np.where(fit.innovations.accepted, fit.innovations.value, np.nan) ** 2, axis=0))
     largest = np.max(np.abs(fit.autocorrelation()), axis=0)
     return {
         "log": fit.log.name,
         "rows": len(fit.log.t),
         "duration": float(fit.log.t[-1]),
-        "readings": fit.samples,
-        "outliers": fit.outliers,
-        "mean_square": fit.square,
-        "moved": fit.moved,
-        "white": fit.white,
+        "readings": fit.reading_count,
+        "outliers": fit.outlier_count,
+        "mean_square": fit.mean_square,
+        "moved": fit.distance,
+        "white": fit.is_white,
         "prediction_rms": dict(zip(names, map(float, rms), strict=True)),
         "largest_autocorrelation": dict(zip(names, map(float, largest), strict=True)),
     }
 
 
-def components(fit: Fit) -> list[str]:
+def component_names(fit: Fit) -> list[str]:
     """Return the name of each component of the innovations."""
     readings: Mapping[str, np.ndarray] = fit.log.readings
     if "x" in readings:
@@ -175,29 +180,29 @@ def innovations(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
 
     They are NaN for missing readings and for outliers.
     """
-    sampled = fit.rows.source[1:] >= 0
+    sampled = fit.rows.log_row[1:] >= 0
     value, variance, accepted = (part[sampled] for part in fit.innovations)
     return np.where(accepted, value, np.nan), np.where(accepted, np.sqrt(variance), np.nan)
 
 
-def verdict(found: Identification) -> list[str]:
-    """Return in words whether the model explains the logs, and how well each parameter is known."""
+def verdict(identification: Identification) -> list[str]:
+    """Return sentences that state whether the model explains each log, and which parameters are not determined."""
     lines = []
-    for fit in [*found.fits, *found.validation]:
-        name = f"{fit.log.name} (validation)" if fit in found.validation else fit.log.name
-        ends = f"mean square {fit.square:.3g} of its expected value"
+    for fit in [*identification.fits, *identification.validation]:
+        name = f"{fit.log.name} (validation)" if fit in identification.validation else fit.log.name
+        details = f"mean square {fit.mean_square:.3g} of its expected value"
         if fit.adjusted is not None:
-            ends += f", for parameters {fit.moved:.2g} sigma from the estimates"
-        if fit.white:
-            lines.append(f"the model explains {name}: its innovations are white, with {ends}")
+            details += f", for parameters {fit.distance:.2g} sigma from the estimates"
+        if fit.is_white:
+            lines.append(f"the model explains {name}: its innovations are white, with {details}")
         else:
             largest = float(np.max(np.abs(fit.autocorrelation())))
             lines.append(
-                f"the model does NOT explain {name}: innovations with {ends} and an autocorrelation of "
+                f"the model does NOT explain {name}: innovations with {details} and an autocorrelation of "
                 f"{largest:.2g} within {LAGS} readings; free more parameters, or add torque_walk to [identify]"
             )
-        if fit.outliers:
-            lines.append(f"{fit.outliers} readings of {name} are outliers and were not used")
-    if not found.converged:
+        if fit.outlier_count:
+            lines.append(f"{fit.outlier_count} readings of {name} are outliers and were not used")
+    if not identification.converged:
         lines.append("the search did NOT converge; its estimates are preliminary")
-    return [*lines, *found.undetermined]
+    return [*lines, *identification.undetermined]

@@ -21,12 +21,12 @@ from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.signals import attitude_tables
 from ptsmc_jax.simulation.catalogues import UNITS
 
-FEWEST = 10  # smallest number of rows of a log
-UNIT_NORM = 1e-3  # largest error of the norm of a quaternion: telemetry often has few digits
+MIN_ROWS = 10  # smallest number of rows of a log
+NORM_TOLERANCE = 1e-3  # largest error of the norm of a quaternion: telemetry often has few digits
 RPM = 2.0 * np.pi / 60.0  # one revolution per minute [rad/s]
-GYRO_DISAGREES = 0.5  # largest median difference of the rotations by attitude and by gyro, relative to the rotation
-OUTLIER = 10.0  # third difference of an outlier, relative to the median
-PARTS = 400  # number of parts of a log in which attitude and gyro are compared
+MAX_GYRO_DIFFERENCE = 0.5  # largest median difference between attitude and gyro, relative to the rotation
+OUTLIER_RATIO = 10.0  # third difference of an outlier, relative to the median
+COMPARED_PARTS = 400  # number of parts of a log in which attitude and gyro are compared
 Values = np.ndarray
 
 
@@ -78,11 +78,12 @@ def measurements(scenario: Scenario, frame: pl.DataFrame, name: str = "the log")
     """
     table = _Table(frame, name)
     spacecraft = scenario.plant.kind == "spacecraft"
-    given: Any = scenario.telemetry or (Telemetry() if spacecraft else StateTelemetry())
-    if frame.height < FEWEST:
-        raise RefusedError(f"{name} has {frame.height} rows, but must have at least {FEWEST}")
-    t = table.times(given.time)
-    return _of_spacecraft(scenario, given, table, t) if spacecraft else _of_state(scenario, given, table, t)
+    config: Any = scenario.telemetry or (Telemetry() if spacecraft else StateTelemetry())
+    if frame.height < MIN_ROWS:
+        raise RefusedError(f"{name} has {frame.height} rows, but must have at least {MIN_ROWS}")
+    t = table.read_times(config.time)
+    read_log = _read_spacecraft_log if spacecraft else _read_state_log
+    return read_log(scenario, config, table, t)
 
 
 class _Table:
@@ -91,17 +92,17 @@ class _Table:
     def __init__(self, frame: pl.DataFrame, name: str):
         self.frame, self.name = frame, name
 
-    def refusal(self, column: str, row: int, allowed: str) -> RefusedError:
+    def make_error(self, column: str, row: int, allowed: str) -> RefusedError:
         """Return the error for a value of a column."""
         value = self.frame[column][row]
-        shown = "empty" if value is None else value
-        return RefusedError(f"{self.name} has {column} {shown} in row {row}, but must have {allowed}")
+        value_text = "empty" if value is None else value
+        return RefusedError(f"{self.name} has {column} {value_text} in row {row}, but must have {allowed}")
 
-    def refuse(self, bad: Values, column: str, allowed: str | Callable[[int], str]) -> None:
-        """Raise RefusedError for the first bad row (rows,), if there is one."""
-        if bad.any():
-            row = int(np.argmax(bad))
-            raise self.refusal(column, row, allowed if isinstance(allowed, str) else allowed(row))
+    def check_rows(self, is_bad: Values, column: str, allowed: str | Callable[[int], str]) -> None:
+        """Raise RefusedError for the first row that `is_bad` (rows,) marks, if there is one."""
+        if is_bad.any():
+            row = int(np.argmax(is_bad))
+            raise self.make_error(column, row, allowed if isinstance(allowed, str) else allowed(row))
 
     def has_any(self, columns: Sequence[str]) -> bool:
         """Return whether the log has at least one of the columns."""
@@ -113,31 +114,31 @@ class _Table:
             raise RefusedError(f"{self.name} has no column {column}; {nearest_name_hint(column, self.frame.columns)}")
         return self.frame[column]
 
-    def numbers(self, columns: Sequence[str], unit: float = 1.0) -> Values:
+    def read_numbers(self, columns: Sequence[str], unit: float = 1.0) -> Values:
         """Return columns (rows, columns) in SI units, NaN for a blank cell; unit: unit of the columns in SI units."""
-        found = []
+        converted = []
         for name in columns:
             series = self.column(name)
             values = series.cast(pl.Float64, strict=False).to_numpy().astype(float)
-            blank = series.is_null().to_numpy() | np.isnan(values)
+            is_blank = series.is_null().to_numpy() | np.isnan(values)
             if series.dtype == pl.String:
-                blank = series.is_null().to_numpy() | series.str.to_lowercase().eq("nan").fill_null(True).to_numpy()
-            self.refuse(~blank & ~np.isfinite(values), name, "a finite number or an empty cell")
-            found.append(values * unit)
-        return np.stack(found, axis=1)
+                is_blank = series.is_null().to_numpy() | series.str.to_lowercase().eq("nan").fill_null(True).to_numpy()
+            self.check_rows(~is_blank & ~np.isfinite(values), name, "a finite number or an empty cell")
+            converted.append(values * unit)
+        return np.stack(converted, axis=1)
 
-    def vectors(self, columns: Sequence[str], unit: float = 1.0) -> Values:
-        """Return columns of vectors, which are complete or blank in each row; see `numbers`."""
-        values = self.numbers(columns, unit)
-        blank = np.isnan(values)
-        partly = blank.any(axis=1) & ~blank.all(axis=1)
-        if partly.any():
-            row = int(np.argmax(partly))
-            column = columns[int(np.argmax(blank[row]))]
-            raise self.refusal(column, row, f"a number there, since {columns[int(np.argmin(blank[row]))]} has one")
+    def read_vectors(self, columns: Sequence[str], unit: float = 1.0) -> Values:
+        """Return columns of vectors, which are complete or blank in each row; see `read_numbers`."""
+        values = self.read_numbers(columns, unit)
+        is_blank = np.isnan(values)
+        is_partly_blank = is_blank.any(axis=1) & ~is_blank.all(axis=1)
+        if is_partly_blank.any():
+            row = int(np.argmax(is_partly_blank))
+            blank, filled = columns[int(np.argmax(is_blank[row]))], columns[int(np.argmin(is_blank[row]))]
+            raise self.make_error(blank, row, f"a number there, since {filled} has one")
         return values
 
-    def times(self, column: str) -> Values:
+    def read_times(self, column: str) -> Values:
         """Return the times (rows,) [s] from the first row on."""
         series = self.column(column)
         if series.dtype.is_temporal():
@@ -146,24 +147,24 @@ class _Table:
         else:
             t = series.cast(pl.Float64, strict=False).to_numpy().astype(float)
             if series.dtype == pl.String and np.isnan(t).all():
-                t = np.array([_seconds(cell) for cell in series])
+                t = np.array([_iso_to_seconds(cell) for cell in series])
                 t = t - t[0] if np.isfinite(t[0]) else t
-        self.refuse(~np.isfinite(t), column, "a number of seconds, or a date and time in ISO 8601")
-        late = np.append(False, np.diff(t) <= 0.0)
-        self.refuse(late, column, lambda row: f"a time after that of row {row - 1}, {series[row - 1]}")
+        self.check_rows(~np.isfinite(t), column, "a number of seconds, or a date and time in ISO 8601")
+        is_not_later = np.append(False, np.diff(t) <= 0.0)
+        self.check_rows(is_not_later, column, lambda row: f"a time after that of row {row - 1}, {series[row - 1]}")
         return t - t[0]
 
-    def held(self, columns: Sequence[str], unit: float) -> Values:
+    def read_commands(self, columns: Sequence[str], unit: float) -> Values:
         """Return commands; a blank cell holds the last value."""
-        values = self.numbers(columns, unit)
+        values = self.read_numbers(columns, unit)
         for k, column in enumerate(columns):
-            self.refuse(np.isnan(values[:1, k]), column, "a number in the first row")
-            there = np.maximum.accumulate(np.where(np.isnan(values[:, k]), 0, np.arange(len(values))))
-            values[:, k] = values[there, k]
+            self.check_rows(np.isnan(values[:1, k]), column, "a number in the first row")
+            last_filled_row = np.maximum.accumulate(np.where(np.isnan(values[:, k]), 0, np.arange(len(values))))
+            values[:, k] = values[last_filled_row, k]
         return values
 
 
-def _seconds(cell: str | None) -> float:
+def _iso_to_seconds(cell: str | None) -> float:
     """Return a date and time in ISO 8601 as seconds since 1970, NaN if it is none. Without a zone it is UTC."""
     try:
         moment = datetime.fromisoformat(cell or "")
@@ -173,97 +174,99 @@ def _seconds(cell: str | None) -> float:
     return (moment - datetime(1970, 1, 1, tzinfo=UTC)).total_seconds()
 
 
-def _names(prefix: str, count: int) -> list[str]:
+def _numbered_columns(prefix: str, count: int) -> list[str]:
     return [f"{prefix}{k + 1}" for k in range(count)]
 
 
-def _of_state(scenario: Scenario, given: Any, table: _Table, t: Values) -> Measurements:
+def _read_state_log(scenario: Scenario, config: Any, table: _Table, t: Values) -> Measurements:
     """Return the log of a chain or a custom system."""
     states, inputs = len(scenario.plant.x0), scenario.inputs
     for key, count in (("state", states), ("input", inputs)):
-        columns = getattr(given, key)
+        columns = getattr(config, key)
         if columns is not None and len(columns) != count:
             raise RefusedError(f"telemetry.{key} has {len(columns)} columns, but must have {count} for this plant")
-    x = table.numbers(given.state or _names("measured_x", states))
-    command = table.held(given.input or _names("sent", inputs), 1.0)
-    complete = np.all(~np.isnan(x), axis=1)
-    if not complete.any():
+    x = table.read_numbers(config.state or _numbered_columns("measured_x", states))
+    command = table.read_commands(config.input or _numbered_columns("sent", inputs), 1.0)
+    is_complete = np.all(~np.isnan(x), axis=1)
+    if not is_complete.any():
         raise RefusedError(f"{table.name} has no row with every component of the state, but must have one")
-    first = _first_row(t, {"x": x}, np.asarray(complete))
-    return Measurements(table.name, t[first:] - t[first], {"x": x[first:]}, command[first:])
+    start = _find_start_row(t, {"x": x}, np.asarray(is_complete))
+    return Measurements(table.name, t[start:] - t[start], {"x": x[start:]}, command[start:])
 
 
-def _of_spacecraft(scenario: Scenario, given: Any, table: _Table, t: Values) -> Measurements:
-    """Return the log of a spacecraft, from the first row with an attitude on."""
+def _read_spacecraft_log(scenario: Scenario, config: Any, table: _Table, t: Values) -> Measurements:
+    """Return the log of a spacecraft, starting at the first row with an attitude."""
     readings = {}
-    columns = given.attitude or _names("measured_q", 4)
-    if given.attitude is not None or table.has_any(columns):
-        readings["attitude"] = _attitude(given, table, columns)
-    columns = given.rate or _names("measured_w", 3)
-    if given.rate is not None or table.has_any(columns):
-        readings["rate"] = table.vectors(columns, UNITS["rad/s"][given.rate_unit])
+    columns = config.attitude or _numbered_columns("measured_q", 4)
+    if config.attitude is not None or table.has_any(columns):
+        readings["attitude"] = _read_attitudes(config, table, columns)
+    columns = config.rate or _numbered_columns("measured_w", 3)
+    if config.rate is not None or table.has_any(columns):
+        readings["rate"] = table.read_vectors(columns, UNITS["rad/s"][config.rate_unit])
     if not readings or all(np.isnan(values).all() for values in readings.values()):
         raise RefusedError(
             f"{table.name} has no attitude and no rate, but must have one of them; name the columns in [telemetry], "
             "such as attitude = [..] or rate = [..]"
         )
-    command, by_channel = _commands(scenario, given, table, t)
-    age = given.attitude_age or ("measured_age" if table.has_any(["measured_age"]) else None)
-    if age is not None and "attitude" in readings:
-        ages = np.nan_to_num(table.numbers([age])[:, 0])
-        table.refuse(ages < 0.0, age, "an age of at least 0 s")
-        t, readings, command = _taken_before(t, ages, readings, command)
-    _check_motion(table, t, readings)
-    lead = readings.get("attitude", readings.get("rate"))
-    assert lead is not None
-    first = _first_row(t, readings, ~np.isnan(lead[:, 0]))
-    rest = {name: values[first:] for name, values in readings.items()}
-    inertia = given.wheel_inertia if given.wheel_speed is not None else None
-    return Measurements(table.name, t[first:] - t[first], rest, command[first:], by_channel, inertia)
+    command, by_channel = _read_torques_or_speeds(scenario, config, table, t)
+    age_column = config.attitude_age or ("measured_age" if table.has_any(["measured_age"]) else None)
+    if age_column is not None and "attitude" in readings:
+        ages = np.nan_to_num(table.read_numbers([age_column])[:, 0])
+        table.check_rows(ages < 0.0, age_column, "an age of at least 0 s")
+        t, readings, command = _move_to_measurement_times(t, ages, readings, command)
+    _check_rates_match_attitudes(table, t, readings)
+    main_readings = readings.get("attitude", readings.get("rate"))
+    assert main_readings is not None
+    start = _find_start_row(t, readings, ~np.isnan(main_readings[:, 0]))
+    kept_readings = {name: values[start:] for name, values in readings.items()}
+    inertia = config.wheel_inertia if config.wheel_speed is not None else None
+    return Measurements(table.name, t[start:] - t[start], kept_readings, command[start:], by_channel, inertia)
 
 
-def _first_row(t: Values, readings: dict[str, Values], complete: Values) -> int:
-    """Return the first complete row without an outlier, because the filter starts from its readings.
+def _find_start_row(t: Values, readings: dict[str, Values], is_complete: Values) -> int:
+    """Return the index of the first complete row without an outlier; the filter starts from its readings.
 
-    A reading is an outlier if the third divided difference of the readings from it on is far beyond the usual one.
+    A reading is an outlier if the third divided difference of this reading and the next three is far above the median.
 
     Args:
         t: times (rows,) [s].
         readings: readings by name.
-        complete: whether a row has the readings that the filter needs, (rows,) bool.
+        is_complete: whether a row has the readings that the filter needs, (rows,) bool.
     """
-    good = complete.copy()
+    is_usable = is_complete.copy()
     for values in readings.values():
-        there = np.flatnonzero(~np.isnan(values).any(axis=1))
-        if there.size > FEWEST:
-            change = values[there]
+        reading_rows = np.flatnonzero(~np.isnan(values).any(axis=1))
+        if reading_rows.size > MIN_ROWS:
+            difference = values[reading_rows]
             for k in (1, 2, 3):
-                change = np.diff(change, axis=0) / (t[there[k:]] - t[there[:-k]])[:, None]
-            sizes = np.max(np.abs(change), axis=1)
-            good[there[:-3][sizes > OUTLIER * np.median(sizes)]] = False
-    return int(np.argmax(good)) if good.any() else int(np.argmax(complete))
+                difference = np.diff(difference, axis=0) / (t[reading_rows[k:]] - t[reading_rows[:-k]])[:, None]
+            magnitudes = np.max(np.abs(difference), axis=1)
+            is_usable[reading_rows[:-3][magnitudes > OUTLIER_RATIO * np.median(magnitudes)]] = False
+    return int(np.argmax(is_usable)) if is_usable.any() else int(np.argmax(is_complete))
 
 
-def _attitude(given: Any, table: _Table, columns: Sequence[str]) -> Values:
+def _read_attitudes(config: Any, table: _Table, columns: Sequence[str]) -> Values:
     """Return unit quaternions (rows, 4), scalar last, from body to inertial axes, with a continuous sign."""
-    q = table.vectors(columns)
+    q = table.read_vectors(columns)
     norm = np.linalg.norm(q, axis=1)
-    off = np.abs(norm - 1.0) > UNIT_NORM
-    table.refuse(off, columns[0], lambda row: f"a unit quaternion in its four columns (the norm is {norm[row]:.6g})")
+    is_off = np.abs(norm - 1.0) > NORM_TOLERANCE
+    table.check_rows(
+        is_off, columns[0], lambda row: f"a unit quaternion in its four columns (the norm is {norm[row]:.6g})"
+    )
     q = q / norm[:, None]
-    q = np.roll(q, -1, axis=1) if given.quaternion_order == "wxyz" else q
-    if given.rotation == "inertial_to_body":
+    q = np.roll(q, -1, axis=1) if config.quaternion_order == "wxyz" else q
+    if config.rotation == "inertial_to_body":
         q[:, :3] *= -1.0
-    there = ~np.isnan(q[:, 0])
-    q[there] = attitude_tables.with_continuous_signs(q[there])
+    has_attitude = ~np.isnan(q[:, 0])
+    q[has_attitude] = attitude_tables.with_continuous_signs(q[has_attitude])
     return q
 
 
-def _commands(scenario: Any, given: Any, table: _Table, t: Values) -> tuple[Values, bool]:
+def _read_torques_or_speeds(scenario: Any, config: Any, table: _Table, t: Values) -> tuple[Values, bool]:
     """Return the commands (rows, channels), and `by_channel` of `Measurements`."""
     count = 3 if scenario.wheels is None else len(scenario.wheels.spin_axes())
     for key in ("wheel_torque", "wheel_speed"):
-        columns = getattr(given, key)
+        columns = getattr(config, key)
         if columns is None:
             continue
         if scenario.wheels is None:
@@ -271,22 +274,22 @@ def _commands(scenario: Any, given: Any, table: _Table, t: Values) -> tuple[Valu
         if len(columns) != count:
             raise RefusedError(f"telemetry.{key} has {len(columns)} columns, but must have {count}, one for each wheel")
         if key == "wheel_torque":
-            return table.held(columns, UNITS["N m"][given.torque_unit]), True
-        speeds = table.numbers(columns, RPM if given.speed_unit == "rpm" else 1.0)
+            return table.read_commands(columns, UNITS["N m"][config.torque_unit]), True
+        speeds = table.read_numbers(columns, RPM if config.speed_unit == "rpm" else 1.0)
         for k, column in enumerate(columns):
-            there = ~np.isnan(speeds[:, k])
-            if not there.any():
+            has_speed = ~np.isnan(speeds[:, k])
+            if not has_speed.any():
                 raise RefusedError(f"{table.name} has no number in the column {column}, but must have one")
-            speeds[:, k] = np.interp(t, t[there], speeds[there, k])
+            speeds[:, k] = np.interp(t, t[has_speed], speeds[has_speed, k])
         return speeds, True
-    columns = given.torque or _names("sent", 3)
-    return table.held(columns, UNITS["N m"][given.torque_unit]), False
+    columns = config.torque or _numbered_columns("sent", 3)
+    return table.read_commands(columns, UNITS["N m"][config.torque_unit]), False
 
 
-def _taken_before(
+def _move_to_measurement_times(
     t: Values, ages: Values, readings: dict[str, Values], command: Values
 ) -> tuple[Values, dict[str, Values], Values]:
-    """Move each attitude to the time at which it was taken, which may need rows of its own.
+    """Move each attitude to the time at which it was measured, in an additional row if necessary.
 
     Args:
         t: times of the rows [s].
@@ -298,44 +301,46 @@ def _taken_before(
         Times, readings and commands of the new rows.
     """
     attitude = readings["attitude"]
-    there = ~np.isnan(attitude[:, 0])
-    taken = t - np.where(there, ages, 0.0)
-    near = np.searchsorted(t, taken)
-    for candidate in (np.clip(near - 1, 0, len(t) - 1), np.clip(near, 0, len(t) - 1)):
-        taken = np.where(np.abs(t[candidate] - taken) < 1e-6, t[candidate], taken)
-    times = np.unique(np.concatenate([t, taken[there & (taken >= t[0])]]))
-    old = np.clip(np.searchsorted(t, times, side="right") - 1, 0, len(t) - 1)
-    exact = t[old] == times
+    has_attitude = ~np.isnan(attitude[:, 0])
+    measured_at = t - np.where(has_attitude, ages, 0.0)
+    next_row = np.searchsorted(t, measured_at)
+    for candidate in (np.clip(next_row - 1, 0, len(t) - 1), np.clip(next_row, 0, len(t) - 1)):
+        measured_at = np.where(np.abs(t[candidate] - measured_at) < 1e-6, t[candidate], measured_at)
+    times = np.unique(np.concatenate([t, measured_at[has_attitude & (measured_at >= t[0])]]))
+    source_row = np.clip(np.searchsorted(t, times, side="right") - 1, 0, len(t) - 1)
+    is_original = t[source_row] == times
     moved = np.full((len(times), 4), np.nan)
-    usable = there & (taken >= t[0])
-    moved[np.searchsorted(times, taken[usable])] = attitude[usable]
-    new = {name: np.where(exact[:, None], values[old], np.nan) for name, values in readings.items()}
-    return times, {**new, "attitude": moved}, command[old]
+    is_usable = has_attitude & (measured_at >= t[0])
+    moved[np.searchsorted(times, measured_at[is_usable])] = attitude[is_usable]
+    new = {name: np.where(is_original[:, None], values[source_row], np.nan) for name, values in readings.items()}
+    return times, {**new, "attitude": moved}, command[source_row]
 
 
-def _check_motion(table: _Table, t: Values, readings: dict[str, Values]) -> None:
+def _check_rates_match_attitudes(table: _Table, t: Values, readings: dict[str, Values]) -> None:
     """Raise RefusedError if the attitudes and the rates describe different motions.
 
-    The rotation of the attitude over a part of the log is compared with the integral of the rate, if the part is
-    between 0.02 and 0.5 rad.
+    The rotation of the attitude over each part of the log is compared with the integral of the rate. Parts with a
+    rotation below 0.02 rad or above 0.5 rad are ignored.
     """
     if set(readings) != {"attitude", "rate"}:
         return
     q, rate = readings["attitude"], readings["rate"]
-    both = np.flatnonzero(~np.isnan(q[:, 0]) & ~np.isnan(rate[:, 0]))
-    ends = both[:: max(1, both.size // PARTS)]
-    if ends.size < FEWEST:
+    common_rows = np.flatnonzero(~np.isnan(q[:, 0]) & ~np.isnan(rate[:, 0]))
+    part_ends = common_rows[:: max(1, common_rows.size // COMPARED_PARTS)]
+    if part_ends.size < MIN_ROWS:
         return
-    known = ~np.isnan(rate[:, 0])
-    filled = np.stack([np.interp(t, t[known], column[known]) for column in rate.T], axis=1)
-    means = 0.5 * (filled[1:] + filled[:-1]) * np.diff(t)[:, None]
-    integral = np.concatenate([np.zeros((1, 3)), np.cumsum(means, axis=0)])[ends]
-    turns = (Rotation.from_quat(q[ends[:-1]]).inv() * Rotation.from_quat(q[ends[1:]])).as_rotvec()
-    size, off = np.linalg.norm(turns, axis=1), np.linalg.norm(turns - np.diff(integral, axis=0), axis=1)
-    clear = (size > 0.02) & (size < 0.5)
-    if clear.sum() >= 5 and np.median(off[clear] / size[clear]) > GYRO_DISAGREES:
+    has_rate = ~np.isnan(rate[:, 0])
+    interpolated = np.stack([np.interp(t, t[has_rate], column[has_rate]) for column in rate.T], axis=1)
+    increments = 0.5 * (interpolated[1:] + interpolated[:-1]) * np.diff(t)[:, None]
+    integral = np.concatenate([np.zeros((1, 3)), np.cumsum(increments, axis=0)])[part_ends]
+    rotations = (Rotation.from_quat(q[part_ends[:-1]]).inv() * Rotation.from_quat(q[part_ends[1:]])).as_rotvec()
+    angle, difference = np.linalg.norm(rotations, axis=1), np.linalg.norm(rotations - np.diff(integral, axis=0), axis=1)
+    is_comparable = (angle > 0.02) & (angle < 0.5)
+    if is_comparable.sum() < 5:
+        return
+    median_ratio = np.median(difference[is_comparable] / angle[is_comparable])
+    if median_ratio > MAX_GYRO_DIFFERENCE:
         raise RefusedError(
             f"{table.name} has rates that do not fit its attitudes: their integral differs from the rotation by a "
-            f"median of {100.0 * np.median(off[clear] / size[clear]):.3g} %; check telemetry.rate_unit, order and "
-            "rotation"
+            f"median of {100.0 * median_ratio:.3g} %; check telemetry.rate_unit, order and rotation"
         )

@@ -1,4 +1,4 @@
-"""CSV tables as spreadsheets, pandas and R write them."""
+"""Read CSV tables that spreadsheets, pandas or R have written. Start with `read`."""
 
 import codecs
 import csv
@@ -24,25 +24,29 @@ def read(path: Path) -> pl.DataFrame:
         OSError: The file cannot be opened.
         ValueError: The table is damaged or ambiguous. The text names the cause.
     """
-    lines = list(io.StringIO(_decoded(path.read_bytes()), newline=None))
+    lines = list(io.StringIO(_decode_text(path.read_bytes()), newline=None))
     try:
-        names, rows = _cells(lines)
+        names, rows = _split_cells(lines)
     except csv.Error as error:
         raise ValueError(f"it is not valid CSV, {error}") from None
     columns = [list(column) for column in zip(*rows, strict=True)] or [[] for _ in names]
-    kept = [(name, column) for name, column in zip(names, columns, strict=True) if not _is_index(name, column)]
-    repeated = next((name for k, (name, _) in enumerate(kept) if name in [other for other, _ in kept[:k]]), None)
+    kept_columns = [
+        (name, column) for name, column in zip(names, columns, strict=True) if not _is_index_column(name, column)
+    ]
+    repeated = next(
+        (name for k, (name, _) in enumerate(kept_columns) if name in [other for other, _ in kept_columns[:k]]), None
+    )
     if repeated is not None:
         raise ValueError(f"it has two columns with the name {repeated}")
-    table = {name: [cell or None for cell in column] for name, column in kept}
+    table = {name: [cell or None for cell in column] for name, column in kept_columns}
     return pl.DataFrame(table, dict.fromkeys(table, pl.String))
 
 
-def _decoded(raw: bytes) -> str:
+def _decode_text(raw: bytes) -> str:
     """Return the text of a file in UTF-8, or in UTF-16 with a byte order mark."""
-    wide = raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    is_utf16 = raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     try:
-        text = raw.decode("utf-16" if wide else "utf-8-sig")
+        text = raw.decode("utf-16" if is_utf16 else "utf-8-sig")
     except UnicodeDecodeError:
         raise ValueError("it is not text in UTF-8, or in UTF-16 with a byte order mark") from None
     if "\0" in text:
@@ -50,16 +54,16 @@ def _decoded(raw: bytes) -> str:
     return text
 
 
-def _cells(lines: Sequence[str]) -> tuple[list[str], list[list[str]]]:
+def _split_cells(lines: Sequence[str]) -> tuple[list[str], list[list[str]]]:
     """Return the column names and the cells of each row, with decimal points."""
-    stated = STATED_SEPARATOR.fullmatch(lines[0]) if lines else None
-    begin = 0 if stated is None else 1
-    while begin < len(lines) and (not lines[begin].strip() or lines[begin].lstrip().startswith("#")):
-        begin += 1
-    if begin == len(lines):
+    separator_line = STATED_SEPARATOR.fullmatch(lines[0]) if lines else None
+    header_line = 0 if separator_line is None else 1
+    while header_line < len(lines) and (not lines[header_line].strip() or lines[header_line].lstrip().startswith("#")):
+        header_line += 1
+    if header_line == len(lines):
         raise ValueError("it has no line with column names")
-    separator = _separator(lines[begin]) if stated is None else stated[1]
-    reader = csv.reader(lines[begin:], delimiter=separator, skipinitialspace=True, strict=True)
+    separator = _find_separator(lines[header_line]) if separator_line is None else separator_line[1]
+    reader = csv.reader(lines[header_line:], delimiter=separator, skipinitialspace=True, strict=True)
     names = [name.strip() for name in next(reader)]
     if all(map(NUMBER.fullmatch, names)):
         raise ValueError("its first line has numbers, but must have the column names, without a # before them")
@@ -69,20 +73,22 @@ def _cells(lines: Sequence[str]) -> tuple[list[str], list[list[str]]]:
         if len(cells) < 2 and not any(cells):
             continue
         if len(cells) != len(names):
-            raise ValueError(f"line {begin + reader.line_num} must have {len(names)} cells, one for each column name")
+            raise ValueError(
+                f"line {header_line + reader.line_num} must have {len(names)} cells, one for each column name"
+            )
         rows.append(cells)
-    return names, _with_points(rows) if separator == ";" else rows
+    return names, _replace_decimal_commas(rows) if separator == ";" else rows
 
 
-def _separator(header: str) -> str:
+def _find_separator(header: str) -> str:
     """Return the character that separates the column names; a comma if there is one column."""
-    found = [one for one in SEPARATORS if len(next(csv.reader([header], delimiter=one))) > 1]
-    if len(found) > 1:
-        raise ValueError(f"its column names are separated by {' and '.join(map(repr, found))}, but must be by one")
-    return found[0] if found else ","
+    candidates = [character for character in SEPARATORS if len(next(csv.reader([header], delimiter=character))) > 1]
+    if len(candidates) > 1:
+        raise ValueError(f"its column names are separated by {' and '.join(map(repr, candidates))}, but must be by one")
+    return candidates[0] if candidates else ","
 
 
-def _with_points(rows: list[list[str]]) -> list[list[str]]:
+def _replace_decimal_commas(rows: list[list[str]]) -> list[list[str]]:
     """Return the cells with decimal points; raise ValueError if some numbers have decimal commas and some points."""
     numbers = [cell for row in rows for cell in row if WITH_COMMA.fullmatch(cell)]
     if not numbers:
@@ -93,7 +99,7 @@ def _with_points(rows: list[list[str]]) -> list[list[str]]:
     return [[cell.replace(",", ".") if WITH_COMMA.fullmatch(cell) else cell for cell in row] for row in rows]
 
 
-def _is_index(name: str, column: Sequence[str]) -> bool:
+def _is_index_column(name: str, column: Sequence[str]) -> bool:
     """Return whether a column has no name and is empty or counts the rows; raise ValueError for other cells."""
     if not UNNAMED.fullmatch(name):
         return False

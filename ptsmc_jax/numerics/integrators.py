@@ -74,7 +74,7 @@ def hermite_middle(start: Array, start_rate: Array, end: Array, end_rate: Array,
 
 _TERMS = 15  # of the Taylor series, whose remainder is below 2^-16 / 15! at a norm of at most 1/2
 _DOUBLINGS = 40  # the largest number, for norms up to 2^39
-_USUAL_DOUBLINGS = 4  # for norms up to 8; few matrices have a larger one
+_USUAL_DOUBLINGS = 4  # for norms up to 8; few matrices have a larger norm
 
 
 @partial(jax.jit, static_argnames="order")
@@ -97,17 +97,17 @@ def phi_functions(x: Float[Array, "n n"], order: int, largest: Scalar | None = N
     Returns:
         [phi_0(x), .., phi_order(x)] [-].
     """
-    one = jnp.eye(x.shape[-1], dtype=x.dtype)
+    identity = jnp.eye(x.shape[-1], dtype=x.dtype)
     size = jax.lax.stop_gradient(row_norm(x) if largest is None else largest)
     doublings = jnp.clip(jnp.ceil(jnp.log2(jnp.maximum(size, 0.5))) + 1.0, 0.0, _DOUBLINGS)
     small = x * 2.0**-doublings
-    top = one / float(factorial(order + _TERMS))
+    top = identity / float(factorial(order + _TERMS))
     # A loop is compiled once instead of once for each term.
     terms = jnp.asarray([1.0 / factorial(order + k) for k in range(_TERMS - 1, -1, -1)], x.dtype)
-    top, _ = jax.lax.scan(lambda top, term: (term * one + small @ top, None), top, terms)
+    top, _ = jax.lax.scan(lambda top, term: (term * identity + small @ top, None), top, terms)
     phi = [top]
     for k in range(order - 1, -1, -1):
-        phi.insert(0, one / factorial(k) + small @ phi[0])
+        phi.insert(0, identity / factorial(k) + small @ phi[0])
 
     def step(k: Any, phi: list[Array]) -> list[Array]:
         return jax.lax.cond(k < doublings, _double, lambda phi: phi, phi)

@@ -37,8 +37,10 @@ def listing(self: Any, indent: str = "") -> str:
         items = self
     else:
         return _format_value(self, indent)
-    inside = f"{indent}  "
-    lines = [f"\n{inside}{name}: {listing(item, inside)}" for name, item in items.items() if item is not None]
+    inner_indent = f"{indent}  "
+    lines = [
+        f"\n{inner_indent}{name}: {listing(item, inner_indent)}" for name, item in items.items() if item is not None
+    ]
     return type(self).__name__ + "".join(lines).replace(": \n", ":\n")
 
 
@@ -66,14 +68,14 @@ def pytree(cls: _Class) -> _Class:
     def flatten(x: Any) -> tuple[tuple, tuple]:
         return tuple([getattr(x, name) for name in names]), tuple([getattr(x, name) for name in static])
 
-    def with_keys(x: Any) -> tuple[tuple, tuple]:
+    def flatten_with_keys(x: Any) -> tuple[tuple, tuple]:
         children, fixed = flatten(x)
         return tuple(zip(keys, children, strict=True)), fixed
 
     def unflatten(fixed: tuple, children: Iterable) -> Any:
         return cls(**dict(zip(names, children, strict=True)), **dict(zip(static, fixed, strict=True)))
 
-    jax.tree_util.register_pytree_with_keys(cls, with_keys, unflatten, flatten)
+    jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
     setattr(cls, "__repr__", listing)  # noqa: B010, pyright refuses an assignment of an unbound function
     return cls
 
@@ -91,7 +93,7 @@ class Function:
 
 
 def is_function(value: Any) -> bool:
-    """Return whether JAX would take a callable for a number: a plain function, a jitted one, a bound method."""
+    """Return whether a value is a callable that JAX would treat as a leaf, such as a plain or jitted function."""
     return callable(value) and jax.tree_util.all_leaves([value])
 
 

@@ -14,7 +14,7 @@ from scipy import special  # instead of `scipy.stats`, whose import takes half a
 MAX_TILT = 60.0  # largest exponential tilt of `_tilted_mean`; the mean then equals the largest or smallest value
 SOBOL_BINS = 32  # bins of an input with equal numbers of trials
 DUPLICATE_CORRELATION = 0.9999  # rank correlation above which two inputs are duplicates
-EXPLAINS = 0.05  # fraction of the variance of a metric's ranks that an input explains at least to be named
+MIN_EXPLAINED = 0.05  # fraction of the variance of a metric's ranks that an input must explain to be named in reports
 SIGNIFICANCE = 0.0027  # probability of a normal number beyond three sigma, the level of the test of categories
 ROUNDING = 1e-12  # relative to the largest value: smaller differences between values are rounding errors
 
@@ -143,14 +143,14 @@ def quantile_interval(ordered: np.ndarray, quantile: float, confidence: float) -
     return below, float(ordered[high - 1]) if high <= n else np.inf
 
 
-def value_at(ordered: np.ndarray, quantile: float) -> float:
-    """Return a quantile of a sample: the smallest of its values that at least this fraction of it does not exceed.
+def sample_quantile(ordered: np.ndarray, quantile: float) -> float:
+    """Return a quantile of a sample: the smallest value that is at least as large as this fraction of the sample.
 
     Args:
         ordered: values (n,), ascending.
         quantile: which quantile, from 0 to 1.
 
-    >>> value_at(np.array([1.0, 2.0, 3.0, 4.0]), quantile=0.5)
+    >>> sample_quantile(np.array([1.0, 2.0, 3.0, 4.0]), quantile=0.5)
     2.0
     """
     return float(ordered[max(0, int(np.ceil(quantile * ordered.size - 1e-9)) - 1)])
@@ -183,11 +183,11 @@ def drivers(
         None. The result is empty if the metric, or every input, is constant.
     """
     ranked = {} if ranked is None else ranked
-    if metric.size < 4 * SOBOL_BINS or not vary(metric):
+    if metric.size < 4 * SOBOL_BINS or not has_variation(metric):
         return {}
     metric_ranks, effects = _ranks(metric), {}
     for name, values in inputs.items():
-        if not vary(values):
+        if not has_variation(values):
             continue
         if name in categories:
             bins = [metric_ranks[values == category] for category in np.unique(values)]
@@ -256,18 +256,18 @@ def _ranks(values: np.ndarray) -> np.ndarray:
     return (rank - rank.mean()) / rank.std()
 
 
-def vary(values: np.ndarray) -> bool:
+def has_variation(values: np.ndarray) -> bool:
     """Return whether values (trials,) differ by more than rounding errors.
 
     Angles with a dispersion from 100 to 100 deg, for example, differ by rounding errors only.
 
-    >>> vary(np.array([1.7453292519943295, 1.7453292519943298])), vary(np.array([1.7453, 1.7454]))
+    >>> has_variation(np.array([1.7453292519943295, 1.7453292519943298])), has_variation(np.array([1.7453, 1.7454]))
     (False, True)
     """
     return bool(np.ptp(values) > ROUNDING * np.max(np.abs(values)))
 
 
-def distinct(inputs: Mapping[str, np.ndarray]) -> list[str]:
+def distinct_inputs(inputs: Mapping[str, np.ndarray]) -> list[str]:
     """Return the names of inputs without duplicates.
 
     An input is a duplicate if it orders the trials as an earlier input does, or in reverse order.
@@ -276,7 +276,9 @@ def distinct(inputs: Mapping[str, np.ndarray]) -> list[str]:
         inputs: values (trials,) by the name of the input.
 
     >>> angle = np.array([0.1, 0.7, 0.4])
-    >>> distinct({"initial_angle": angle, "initial_q4": np.cos(angle / 2), "initial_w1": np.array([2.0, 1.0, 3.0])})
+    >>> distinct_inputs(
+    ...     {"initial_angle": angle, "initial_q4": np.cos(angle / 2), "initial_w1": np.array([2.0, 1.0, 3.0])}
+    ... )
     ['initial_angle', 'initial_w1']
     """
     distinct_ranks: dict[str, np.ndarray] = {}
@@ -287,7 +289,7 @@ def distinct(inputs: Mapping[str, np.ndarray]) -> list[str]:
     return list(distinct_ranks)
 
 
-def fewest_for(failures: int, quantile: float, confidence: float) -> int:
+def fewest_trials(failures: int, quantile: float, confidence: float) -> int:
     """Return the smallest number of trials that verifies a quantile requirement despite some failures.
 
     Args:
@@ -295,17 +297,17 @@ def fewest_for(failures: int, quantile: float, confidence: float) -> int:
         quantile: required fraction of successes, from 0 to 1.
         confidence: one-sided confidence of the verification [-].
 
-    >>> [fewest_for(failures, quantile=0.9973, confidence=0.9) for failures in (0, 1, 2)]
+    >>> [fewest_trials(failures, quantile=0.9973, confidence=0.9) for failures in (0, 1, 2)]
     [852, 1440, 1970]
     """
 
     def is_verified(trials: int) -> bool:
         return fraction_bound(trials - failures, trials, confidence) >= quantile
 
-    enough = failures + 1
-    while not is_verified(enough):
-        enough *= 2
-    return failures + 1 + bisect.bisect_left(range(failures + 1, enough), True, key=is_verified)
+    upper = failures + 1
+    while not is_verified(upper):
+        upper *= 2
+    return failures + 1 + bisect.bisect_left(range(failures + 1, upper), True, key=is_verified)
 
 
 def most_extreme(values: np.ndarray, failed: np.ndarray, count: int, *, larger_is_better: bool = False) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Simulate the cases of the paper and compare its claims with measurements. Start with `fly_cases` and `claims`.
+"""Simulate the cases of the paper and compare its claims with measurements. Start with `simulate_cases` and `claims`.
 
 Z. Chen, X. Ju, Z. Wang, Q. Li: The prescribed time sliding mode control for attitude tracking of spacecraft.
 """
@@ -12,7 +12,7 @@ from ptsmc_jax.campaigns import runs
 from ptsmc_jax.campaigns.runs import Run
 from ptsmc_jax.scenario import from_tables, study
 
-CALM = {"amplitude": [0.0] * 3}  # no disturbance, with the same compiled program
+NO_DISTURBANCE = {"amplitude": [0.0] * 3}  # no disturbance, with the same compiled program
 _CHAIN = {"disturbance_bound": 0.01, "delta": 0.01}  # delta from Remark 1, since Section 3 gives none
 # name: (figures, their subject, tables of the scenario)
 CASES: dict[str, tuple[str, str, dict[str, Any]]] = {
@@ -41,44 +41,46 @@ class Claim:
     values: dict[str, float]
 
 
-def fly_cases() -> dict[str, Run]:
+def simulate_cases() -> dict[str, Run]:
     """Simulate every case of the paper in continuous time; return the runs by name."""
     return {name: runs.simulate(study(from_tables(tables))) for name, (_, _, tables) in CASES.items()}
 
 
 def claims(cases: dict[str, Run]) -> list[Claim]:
-    """Compare each claim of the paper with its measurement; cases: as `fly_cases` returns them."""
+    """Compare each claim of the paper with its measurement; cases: as `simulate_cases` returns them."""
     return [
-        *(_stabilised(name, cases[name]) for name in _CHAINS),
-        _accuracy("4.2 A", "errors of 10E-4 at t_f = 30 and 40 s", 1e-4, cases, "case_1_30", "case_1_40"),
-        _accuracy("4.2 B", "error of 10E-4 at t_f for eta = 3", 1e-4, cases, "case_2_eta_3"),
-        _accuracy("4.2 B", "error of 10E-5 at t_f for eta = 5", 1e-5, cases, "case_2_eta_5"),
-        _larger_eta_is_more_accurate(cases),
-        _initial_torque("4.2 A", "a shorter t_f asks for a larger initial torque", cases, "case_1_30", "case_1_40"),
-        _initial_torque("4.2 B", "so does a larger eta", cases, "case_2_eta_5", "case_2_eta_3"),
-        _faster(cases),
-        _within_t_f(cases),
-        _independent_of_the_start(),
-        _no_singularity(cases),
-        _bounded_when_sampled(cases),
-        _stays(cases),
+        *(_check_stabilisation(name, cases[name]) for name in _CHAINS),
+        _check_accuracy("4.2 A", "errors of 10E-4 at t_f = 30 and 40 s", 1e-4, cases, "case_1_30", "case_1_40"),
+        _check_accuracy("4.2 B", "error of 10E-4 at t_f for eta = 3", 1e-4, cases, "case_2_eta_3"),
+        _check_accuracy("4.2 B", "error of 10E-5 at t_f for eta = 5", 1e-5, cases, "case_2_eta_5"),
+        _check_larger_eta_is_more_accurate(cases),
+        _check_initial_torque(
+            "4.2 A", "a shorter t_f asks for a larger initial torque", cases, "case_1_30", "case_1_40"
+        ),
+        _check_initial_torque("4.2 B", "so does a larger eta", cases, "case_2_eta_5", "case_2_eta_3"),
+        _check_larger_eta_is_faster(cases),
+        _check_convergence_within_t_f(cases),
+        _check_independence_of_start(),
+        _check_no_singularity(cases),
+        _check_bounded_when_sampled(cases),
+        _check_stays_at_origin(cases),
     ]
 
 
-def _size(run: Run) -> np.ndarray:
+def _error_norm(run: Run) -> np.ndarray:
     """Return the norm of a chain's state, or the largest component of the attitude error vector, over time (n,)."""
     one_array = isinstance(run.log.x, np.ndarray)
     return np.linalg.norm(run.log.x, axis=1) if one_array else np.abs(run.log.error).max(axis=1)
 
 
-def _at_and_after(run: Run) -> tuple[float, float]:
-    """Return `_size` at t_f and its largest value from t_f on."""
-    size = _size(run)
+def _error_at_and_after_t_f(run: Run) -> tuple[float, float]:
+    """Return the error norm at t_f, and its largest value from t_f on; see `_error_norm`."""
+    error = _error_norm(run)
     k = int(np.flatnonzero(run.log.t <= float(run.parts.controller.t_f))[-1])  # t_f is a node of the grid
-    return float(size[k]), float(size[k:].max())
+    return float(error[k]), float(error[k:].max())
 
 
-def _reached(run: Run) -> float:
+def _time_to_one_percent(run: Run) -> float:
     """Return the time [s] after which the error stays below 1 % of the initial error."""
     size = np.linalg.norm(run.log.error, axis=1)
     return float(run.log.t[np.flatnonzero(size > 0.01 * size[0])[-1] + 1])
@@ -89,39 +91,39 @@ def _first_torque(run: Run) -> float:
     return float(np.abs(run.log.u[0]).max())
 
 
-def _stabilised(name: str, run: Run) -> Claim:
-    at, after = _at_and_after(run)
-    start = float(_size(run)[0])
+def _check_stabilisation(name: str, run: Run) -> Claim:
+    at_t_f, after_t_f = _error_at_and_after_t_f(run)
+    start = float(_error_norm(run)[0])
     order = run.parts.controller.order
     return Claim(
         f"3.{1 if order == 2 else 3}",
         f"Fig. {CASES[name][0]}: the origin is stabilised within t_f (order {order})",
-        f"|x| falls from {start:.3g} to {at:.1e} at t_f, at most {after:.1e} after it",
-        "holds" if after < STABILISED * start else "differs",
-        "not to zero: the smooth sign leaves a residual, and the hand-over delta before t_f starts from "
-        f"|x| = {float(_size(run)[np.flatnonzero(run.log.t <= float(run.parts.controller.hand_over))[-1]]):.1e}",
-        {"at_t_f": at, "largest_after": after, "initial": start},
+        f"|x| falls from {start:.3g} to {at_t_f:.1e} at t_f, at most {after_t_f:.1e} after it",
+        "holds" if after_t_f < STABILISED * start else "differs",
+        "not to zero: the smooth sign causes a residual error, and the hand-over delta before t_f starts from "
+        f"|x| = {float(_error_norm(run)[np.flatnonzero(run.log.t <= float(run.parts.controller.hand_over))[-1]]):.1e}",
+        {"at_t_f": at_t_f, "largest_after": after_t_f, "initial": start},
     )
 
 
-def _accuracy(where: str, claim: str, stated: float, cases: dict[str, Run], *names: str) -> Claim:
-    pairs = [_at_and_after(cases[name]) for name in names]
-    at, after = max(p[0] for p in pairs), max(p[1] for p in pairs)
-    verdict = "holds" if after <= stated else "holds in part" if at <= stated else "differs"
-    side = "below" if after <= stated else "above"
+def _check_accuracy(where: str, claim: str, stated: float, cases: dict[str, Run], *names: str) -> Claim:
+    pairs = [_error_at_and_after_t_f(cases[name]) for name in names]
+    at_t_f, after_t_f = max(p[0] for p in pairs), max(p[1] for p in pairs)
+    verdict = "holds" if after_t_f <= stated else "holds in part" if at_t_f <= stated else "differs"
+    side = "below" if after_t_f <= stated else "above"
     return Claim(
         where,
         f"{claim} (read as {stated:g})",
-        f"largest component {at:.1e} at t_f, {after:.1e} in the 10 s after it",
+        f"largest component {at_t_f:.1e} at t_f, {after_t_f:.1e} in the 10 s after it",
         verdict,
         "an accurate integration of the paper's equations is far better at t_f; the law then holds the "
         f"estimation error, {side} the paper's figure",
-        {"at_t_f": at, "largest_after": after, "paper": stated},
+        {"at_t_f": at_t_f, "largest_after": after_t_f, "paper": stated},
     )
 
 
-def _larger_eta_is_more_accurate(cases: dict[str, Run]) -> Claim:
-    low, high = (_at_and_after(cases[name]) for name in ("case_2_eta_3", "case_2_eta_5"))
+def _check_larger_eta_is_more_accurate(cases: dict[str, Run]) -> Claim:
+    low, high = (_error_at_and_after_t_f(cases[name]) for name in ("case_2_eta_3", "case_2_eta_5"))
     better = high[1] < 0.5 * low[1] and high[0] < 0.5 * low[0]
     return Claim(
         "4.2 B, Remark 1",
@@ -134,22 +136,22 @@ def _larger_eta_is_more_accurate(cases: dict[str, Run]) -> Claim:
     )
 
 
-def _initial_torque(where: str, claim: str, cases: dict[str, Run], larger: str, smaller: str) -> Claim:
+def _check_initial_torque(where: str, claim: str, cases: dict[str, Run], larger: str, smaller: str) -> Claim:
     a, b = _first_torque(cases[larger]), _first_torque(cases[smaller])
     laws = (cases[name].parts.controller for name in (larger, smaller))
-    rule = [float(law.eta / law.t_f) ** 2 for law in laws]
+    squares = [float(law.eta / law.t_f) ** 2 for law in laws]
     return Claim(
         where,
         claim,
         f"{a:.3f} N m against {b:.3f} N m, {a / b:.3f} times as much",
         "holds" if a > b else "differs",
-        f"the first torque is 2 (eta / t_f)^2 |(J n)_i| tan(theta / 2): {rule[0] / rule[1]:.3f} times as much",
-        {"larger": a, "smaller": b, "ratio": a / b, "ratio_by_theory": rule[0] / rule[1]},
+        f"the first torque is 2 (eta / t_f)^2 |(J n)_i| tan(theta / 2): {squares[0] / squares[1]:.3f} times as much",
+        {"larger": a, "smaller": b, "ratio": a / b, "ratio_by_theory": squares[0] / squares[1]},
     )
 
 
-def _faster(cases: dict[str, Run]) -> Claim:
-    slow, fast = (_reached(cases[name]) for name in ("case_2_eta_3", "case_2_eta_5"))
+def _check_larger_eta_is_faster(cases: dict[str, Run]) -> Claim:
+    slow, fast = (_time_to_one_percent(cases[name]) for name in ("case_2_eta_3", "case_2_eta_5"))
     return Claim(
         "4.2 B",
         "a larger eta converges faster",
@@ -160,28 +162,28 @@ def _faster(cases: dict[str, Run]) -> Claim:
     )
 
 
-def _within_t_f(cases: dict[str, Run]) -> Claim:
-    ratios = {name: _at_and_after(cases[name])[1] / float(_size(cases[name])[0]) for name in SPACECRAFT}
+def _check_convergence_within_t_f(cases: dict[str, Run]) -> Claim:
+    ratios = {name: _error_at_and_after_t_f(cases[name])[1] / float(_error_norm(cases[name])[0]) for name in SPACECRAFT}
     worst = max(ratios.values())
     return Claim(
         "4.2",
         "the attitude is stabilised within t_f (all four cases)",
         f"from t_f on at most {worst:.1e} of the initial error",
         "holds" if worst < STABILISED else "differs",
-        "practically, not exactly: with delta > 0 and an estimation error nothing is zero at t_f",
+        "practically, not exactly: with delta > 0 and an estimation error, the attitude error is not zero at t_f",
         ratios,
     )
 
 
-def _independent_of_the_start() -> Claim:
+def _check_independence_of_start() -> Claim:
     times, spread = {}, {}
-    quiet = {"disturbance": CALM, "controller": {"t_f": 35.0, "disturbance_rate_bound": 0.0}}
+    quiet = {"disturbance": NO_DISTURBANCE, "controller": {"t_f": 35.0, "disturbance_rate_bound": 0.0}}
     for kind, tables in (("quiet", quiet), ("disturbed", {"controller": {"t_f": 35.0}})):
         for angle in (20, 80, 140):
             start = {"initial": {"rotvec_deg": [angle / 3**0.5] * 3}}
-            times[f"{kind}_{angle}"] = _reached(runs.simulate(study(from_tables({**start, **tables}))))
-        reached = [value for name, value in times.items() if name.startswith(kind)]
-        spread[f"spread_{kind}"] = max(reached) - min(reached)
+            times[f"{kind}_{angle}"] = _time_to_one_percent(runs.simulate(study(from_tables({**start, **tables}))))
+        kind_times = [value for name, value in times.items() if name.startswith(kind)]
+        spread[f"spread_{kind}"] = max(kind_times) - min(kind_times)
     disturbed = ", ".join(f"{times[f'disturbed_{angle}']:.2f} s" for angle in (20, 80, 140))
     small, large = spread["spread_quiet"] < 0.01 * 35.0, spread["spread_disturbed"] > 0.01 * 35.0
     return Claim(
@@ -190,18 +192,18 @@ def _independent_of_the_start() -> Claim:
         f"1 % of the initial error after {disturbed} from 20, 80, 140 degrees; {spread['spread_quiet']:.2f} s apart "
         "without a disturbance",
         "differs" if not small else "holds in part" if large else "holds",
-        "the motion is the initial error times a function of t / t_f; what the observer misses adds to it, and weighs "
-        "more where that error is small",
+        "the motion is the initial error times a function of t / t_f; the estimation error of the observer adds to it, "
+        "and matters more if the initial error is small",
         {**times, **spread},
     )
 
 
-def _no_singularity(cases: dict[str, Run]) -> Claim:
+def _check_no_singularity(cases: dict[str, Run]) -> Claim:
     ratios = {}
     for name, run in cases.items():
         t_f = float(run.parts.controller.t_f)
-        near = np.abs(run.log.t - t_f) < 0.02 * t_f
-        ratios[name] = float(np.abs(run.log.u[near]).max()) / _first_torque(run)
+        is_near_t_f = np.abs(run.log.t - t_f) < 0.02 * t_f
+        ratios[name] = float(np.abs(run.log.u[is_near_t_f]).max()) / _first_torque(run)
     return Claim(
         "Theorems 1 to 3",
         "no singularity: the control stays bounded as its gains grow without bound",
@@ -212,7 +214,7 @@ def _no_singularity(cases: dict[str, Run]) -> Claim:
     )
 
 
-def _bounded_when_sampled(cases: dict[str, Run]) -> Claim:
+def _check_bounded_when_sampled(cases: dict[str, Run]) -> Claim:
     values = {}
     for name in ("case_2_eta_3", "case_2_eta_5"):
         tables = {
@@ -223,25 +225,25 @@ def _bounded_when_sampled(cases: dict[str, Run]) -> Claim:
         values[name] = runs.simulate(study(from_tables(tables))).metrics["peak_torque"]
         values[f"{name}_continuous"] = cases[name].metrics["peak_torque"]
     three, five = values["case_2_eta_3"], values["case_2_eta_5"]
-    more = max(three / values["case_2_eta_3_continuous"], five / values["case_2_eta_5_continuous"])
+    largest_ratio = max(three / values["case_2_eta_3_continuous"], five / values["case_2_eta_5_continuous"])
     return Claim(
         "Remark 1",
         "handing over a small delta before t_f makes the gain practical at a finite sampling frequency",
         f"delta = 0.05 s at 20 Hz, star tracker noise of 2e-5 rad: peaks of {three:.2f} and {five:.2f} N m for eta = 3 "
-        f"and 5, up to {more:.0f} times the continuous ones",
-        "holds" if more < 1.5 else "differs",
+        f"and 5, up to {largest_ratio:.0f} times the continuous ones",
+        "holds" if largest_ratio < 1.5 else "differs",
         "a period before the hand-over the gain is still 2 J eta^2 / tau^2, and it multiplies noise: tune delta for it",
         values,
     )
 
 
-def _stays(cases: dict[str, Run]) -> Claim:
-    at, after = _at_and_after(cases["case_1_30"])
+def _check_stays_at_origin(cases: dict[str, Run]) -> Claim:
+    at_t_f, after_t_f = _error_at_and_after_t_f(cases["case_1_30"])
     return Claim(
         "(23), (34), (51)",
         "the system stays at the origin after t_f",
-        f"the error rises from {at:.1e} at t_f to {after:.1e}",
-        "holds" if after < 10 * at else "differs",
-        "the estimate lags behind d, and the law holds what that leaves: rates 1 and K1/2 after the hand-over",
-        {"at_t_f": at, "largest_after": after},
+        f"the error rises from {at_t_f:.1e} at t_f to {after_t_f:.1e}",
+        "holds" if after_t_f < 10 * at_t_f else "differs",
+        "the estimate lags behind d, and the law holds the residual error: rates 1 and K1/2 after the hand-over",
+        {"at_t_f": at_t_f, "largest_after": after_t_f},
     )

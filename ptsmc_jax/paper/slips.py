@@ -37,21 +37,21 @@ class Slip:
 
 
 def slips(cases: dict[str, Run]) -> list[Slip]:
-    """Return each error with its evidence; cases: as `claims.fly_cases` returns them."""
+    """Return each error with its evidence; cases: as `claims.simulate_cases` returns them."""
     return [
-        _expansion(),
-        _theorem_3(),
-        _missing_term(),
-        _factor_of_the_bound([cases[name] for name in claims.SPACECRAFT]),
-        _decay_of_the_bound(),
-        _initial_estimate(),
-        _effective_gain(),
-        _sign_of_q4(),
-        _grows_like_one_over_q4(),
+        _show_expansion_coefficients(),
+        _show_factor_of_theorem_3(),
+        _show_missing_term(),
+        _show_factor_of_bound([cases[name] for name in claims.SPACECRAFT]),
+        _show_decay_of_bound(),
+        _show_initial_estimate(),
+        _show_effective_gain(),
+        _show_sign_of_q4(),
+        _show_growth_near_q4_zero(),
     ]
 
 
-def _expansion() -> Slip:
+def _show_expansion_coefficients() -> Slip:
     """Compare (36), by automatic differentiation, with (37) and the coefficients c_i."""
     t_f, eta, t = 5.0, 4.3, 1.7
 
@@ -59,18 +59,18 @@ def _expansion() -> Slip:
         return 2.0 - 0.7 * time + 0.3 * time**2 - 0.1 * time**3
 
     @jax.jit
-    def off(t: jax.Array) -> jax.Array:
-        derivative, x_derivative, states, found = (lambda time: x(time) / (t_f - time) ** eta), x, [x(t)], []
+    def relative_differences(t: jax.Array) -> jax.Array:
+        derivative, x_derivative, states, differences = (lambda time: x(time) / (t_f - time) ** eta), x, [x(t)], []
         tau = t_f - t
         for n in (2, 3, 4, 5):
             derivative, x_derivative = jax.grad(derivative), jax.grad(x_derivative)
             states.append(x_derivative(t))
             c = surface_coefficients(jnp.asarray(eta), n)
             s = sum(c[i] * tau**i * states[i] for i in range(n))
-            found.append(derivative(t) * tau ** (eta + n - 1) / s - 1.0)
-        return jnp.abs(jnp.stack(found))
+            differences.append(derivative(t) * tau ** (eta + n - 1) / s - 1.0)
+        return jnp.abs(jnp.stack(differences))
 
-    worst = float(off(t).max())
+    worst = float(relative_differences(t).max())
     return Slip(
         "(37), (38), (40)",
         'c_i is an "expansion parameter", sums of (38) and (40) end at n-1',
@@ -80,7 +80,7 @@ def _expansion() -> Slip:
     )
 
 
-def _theorem_3() -> Slip:
+def _show_factor_of_theorem_3() -> Slip:
     tables = claims.CASES["third_order"][2]
     quiet = {"disturbance": {"amplitude": [0.0]}, "controller": {**tables["controller"], "disturbance_bound": 0.0}}
     run = runs.simulate(study(from_tables({**tables, **quiet})))
@@ -98,17 +98,17 @@ def _theorem_3() -> Slip:
     )
 
 
-def _missing_term() -> Slip:
+def _show_missing_term() -> Slip:
     """Simulate x'' = -K1 s - F with and without F = x', from x = 1, x' = -1 (s = 0), with K1 = 1."""
 
-    def largest(factor: float) -> float:
+    def largest_s(factor: float) -> float:
         def rate(_: float, y: np.ndarray) -> list[float]:
             return [y[1], -(y[0] + y[1]) - factor * y[1]]
 
         motion = solve_ivp(rate, (0.0, 10.0), [1.0, -1.0], rtol=1e-10, atol=1e-12)
         return float(np.abs(motion.y.sum(axis=0)).max())
 
-    with_term, without = largest(1.0), largest(0.0)
+    with_term, without = largest_s(1.0), largest_s(0.0)
     return Slip(
         "(29), second branch",
         "no term for the x_1' of s = x_1 + x_1'",
@@ -118,7 +118,7 @@ def _missing_term() -> Slip:
     )
 
 
-def _over_bound(run: Run, start: float) -> float:
+def _error_over_bound(run: Run, start: float) -> float:
     """Return the largest estimation error over K2 after the time `start` [s]."""
     error = np.linalg.norm(run.log.d_hat - run.log.disturbance, axis=1)
     bound = np.asarray(jax.vmap(run.parts.observer.error_bound())(jnp.asarray(run.log.t)))
@@ -126,8 +126,8 @@ def _over_bound(run: Run, start: float) -> float:
     return float((error[later] / bound[later]).max())
 
 
-def _factor_of_the_bound(cases: list[Run]) -> Slip:
-    corrected = max(_over_bound(run, 0.0) for run in cases)
+def _show_factor_of_bound(cases: list[Run]) -> Slip:
+    corrected = max(_error_over_bound(run, 0.0) for run in cases)
     printed = corrected * 3**0.5
     return Slip(
         "(55)",
@@ -138,7 +138,7 @@ def _factor_of_the_bound(cases: list[Run]) -> Slip:
     )
 
 
-def _decay_of_the_bound() -> Slip:
+def _show_decay_of_bound() -> Slip:
     inertia = np.array([[12.0, 5.0, -2.0], [5.0, 11.0, 2.0], [-2.0, 2.0, 14.0]])
     gain = np.array([10.0, 10.0, 10.0])
     a = gain[:, None] * np.linalg.inv(inertia)
@@ -157,12 +157,12 @@ def _decay_of_the_bound() -> Slip:
     )
 
 
-def _initial_estimate() -> Slip:
+def _show_initial_estimate() -> Slip:
     bound = {"disturbance_rate_bound": 1e-3}  # the published bound, not the bound 0 of a constant
     tables = {"disturbance": {"frequency": [0.0] * 3, "phase": [np.pi / 2] * 3}}  # constant
     true_bound = {**bound, "initial_estimate_error": 0.01 * 3**0.5}
     ratios = [
-        _over_bound(runs.simulate(study(from_tables({**tables, "controller": controller}))), 1.0)
+        _error_over_bound(runs.simulate(study(from_tables({**tables, "controller": controller}))), 1.0)
         for controller in (bound, true_bound)
     ]
     return Slip(
@@ -175,9 +175,9 @@ def _initial_estimate() -> Slip:
     )
 
 
-def _effective_gain() -> Slip:
+def _show_effective_gain() -> Slip:
     tables = {
-        "disturbance": claims.CALM,
+        "disturbance": claims.NO_DISTURBANCE,
         "controller": {"disturbance_rate_bound": 0.0, "delta": 5.0, "k1": 1.6},
     }
     run = runs.simulate(study(from_tables(tables)))
@@ -204,11 +204,11 @@ class _Unaligned(AdditiveKinematics):
         return jnp.abs(x.q[3])
 
 
-def _sign_of_q4() -> Slip:
+def _show_sign_of_q4() -> Slip:
     tables = {
         "initial": {"quat_xyzw": [0.0, 0.0, 0.0, -1.0]},
         "reference": {"rotvec_deg": [0.0, 0.0, 60.0]},
-        "disturbance": claims.CALM,
+        "disturbance": claims.NO_DISTURBANCE,
         "controller": {"disturbance_rate_bound": 0.0},
     }
     ready = study(from_tables(tables))
@@ -233,7 +233,7 @@ def _sign_of_q4() -> Slip:
     )
 
 
-def _grows_like_one_over_q4() -> Slip:
+def _show_growth_near_q4_zero() -> Slip:
     inertia = jnp.diag(jnp.asarray([10.0, 12.0, 14.0]))
     peaks = {}
     for angle in (90.0, 170.0, 179.0):

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ptsmc_jax.dispersions.table_rows import OF_ROWS
+from ptsmc_jax.dispersions.table_rows import RESULT_COLUMNS
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.laws.base import Law, Sample
 from ptsmc_jax.observers.base import Bound
@@ -198,7 +198,8 @@ def _check_sensors(parts: Parts, call: _Checker) -> None:
 
 def _check_draw(parts: Parts, dispersion: Dispersion, call: _Checker) -> None:
     custom: Any = dispersion.custom
-    used_names = {"status", "reason", "bad_time", *OF_ROWS, *OF_ROWS.values(), *CATALOGUE, *dispersion.values(parts)}
+    row_names = {*RESULT_COLUMNS, *RESULT_COLUMNS.values()}
+    used_names = {"status", "reason", "bad_time", *row_names, *CATALOGUE, *dispersion.values(parts)}
     c = jnp.full(custom.count, 0.5)
     changed = call("at", custom.at, c, parts)
     before, after = (jax.tree.map(lambda v: _type_and_shape(jnp.asarray(v)), tree) for tree in (parts, changed))

@@ -89,7 +89,7 @@ def test_inputs_of_the_worst_trial_have_percentile_median_and_sensitivity(monkey
     assert one["trials"] == ended.height
     table = table.with_columns(peak_torque=pl.Series([*cut[:-1], None]))  # a metric that one trial does not have
     assert {row["value"] for row in why(Rows(), ["peak_torque"], 401) if row["trial"] == 400} == {None}
-    assert statistics.distinct({"a": angle, "b": -angle, "c": rate}) == ["a", "c"]
+    assert statistics.distinct_inputs({"a": angle, "b": -angle, "c": rate}) == ["a", "c"]
 
 
 def test_every_random_input_may_be_a_reason(monkeypatch):
@@ -103,7 +103,7 @@ def test_every_random_input_may_be_a_reason(monkeypatch):
     kept = [
         "trial",
         *run_tables.STATUS_COLUMNS,
-        *run_tables.OF_ROWS.values(),
+        *run_tables.RESULT_COLUMNS.values(),
         *ready.catalogue,
         *run_tables.SAMPLES,
         *columns,
@@ -122,5 +122,5 @@ def test_dispersion_of_zero_width_is_not_a_reason():
     driven = statistics.drivers({"initial_angle": angle, "initial_w1": rate}, rate**3)
     assert list(driven) == ["initial_w1"]
     assert statistics.drivers({"initial_w1": rate}, angle) == {}
-    assert not statistics.vary(angle)
-    assert statistics.vary(1e-9 * rate)
+    assert not statistics.has_variation(angle)
+    assert statistics.has_variation(1e-9 * rate)

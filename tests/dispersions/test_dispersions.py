@@ -218,7 +218,7 @@ def test_slender_bodies_have_the_stated_distribution(moments, std):
     found = np.diagonal(inertia, axis1=1, axis2=2)[:, np.argsort(moments)]
     assert np.all(2.0 * found.max(axis=1) <= found.sum(axis=1))
     c, a, b = ((found / np.sort(moments) - 1.0) / std).T
-    assert np.abs([a, b, c]).max() <= numbers.FARTHEST * (1 + 1e-9)
+    assert np.abs([a, b, c]).max() <= numbers.TRUNCATION_SIGMAS * (1 + 1e-9)
 
     def cdf(s):
         def antiderivative(s):  # integral of (1 + std s) times the normal density
@@ -252,7 +252,7 @@ def test_fallback_samples_have_the_distribution_of_repeated_rejection(moments, s
     standard = rng.standard_normal((1 << 19, 3))
     expected = np.array(moments) * (1.0 + std * standard)
     is_physical = (2.0 * expected.max(axis=1) <= expected.sum(axis=1)) & (expected.min(axis=1) > 0.0)
-    expected = expected[is_physical & (np.abs(standard).max(axis=1) <= numbers.FARTHEST)]
+    expected = expected[is_physical & (np.abs(standard).max(axis=1) <= numbers.TRUNCATION_SIGMAS)]
     assert len(expected) > 1 << 15
     for weights in ([1, 0, 0], [0, 1, 0], [0, 0, 1], [1, -1, 0], [0, 1, -1], [1, 1, -1], [1, 1, 1]):
         one, other = found @ np.array(weights), expected @ np.array(weights)
@@ -268,7 +268,7 @@ def test_first_physical_candidate_is_used():
     standard = c[:, : 3 * inertias.CANDIDATES].reshape(len(c), -1, 3)
     candidates = moments * (1.0 + std * standard)
     is_valid = 2.0 * candidates.max(axis=2) <= candidates.sum(axis=2)
-    is_valid &= np.abs(standard).max(axis=2) <= numbers.FARTHEST
+    is_valid &= np.abs(standard).max(axis=2) <= numbers.TRUNCATION_SIGMAS
     some, first = is_valid.any(axis=1), is_valid.argmax(axis=1)
     assert {0, 1, 2, 3} <= set(first[some])
     np.testing.assert_allclose(found[some], candidates[some, first[some]], rtol=1e-14)

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from ptsmc_jax import formulas, scenario
 from ptsmc_jax.campaigns import runs
 from ptsmc_jax.devices import actuators, reaction_wheels
-from ptsmc_jax.dispersions.numbers import FARTHEST
+from ptsmc_jax.dispersions.numbers import TRUNCATION_SIGMAS
 from ptsmc_jax.dispersions.quantities import QUANTITIES, read_columns
 from ptsmc_jax.numerics import draws, paths
 from ptsmc_jax.plants import flexible_body
@@ -290,7 +290,7 @@ def test_widest_allowed_coupling_is_physical_at_its_extreme_and_a_wider_one_is_r
     tables = {**FLIGHT, "spacecraft": {"inertia": [10.0, 12.0, 14.0]},
               "flexible": {"frequency": [6.0], "coupling": [[3.0, 0.0, 0.0]]}, "dispersion": dispersion}  # fmt: skip
     ready = scenario.study(scenario.from_tables(tables))
-    ends = {"mode_coupling": vector([1.0]), "inertia": jnp.zeros(67).at[:3].set(-FARTHEST)}
+    ends = {"mode_coupling": vector([1.0]), "inertia": jnp.zeros(67).at[:3].set(-TRUNCATION_SIGMAS)}
     plant = paths.get(ready.dispersion.at(ready.parts, ends), "plant")
     smallest = np.linalg.eigvalsh(plant.rest_inertia)[0]
     assert 0.0 < smallest < 0.05

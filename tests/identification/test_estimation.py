@@ -49,20 +49,20 @@ def identified():
 
 def test_outliers_and_missing_samples_do_not_spoil_the_estimates(identified):
     found, drift = identified
-    assert found.good, found.verdict
+    assert found.is_identified, found.verdict
     assert np.all(np.abs(found.estimate - ENTRIES) < 3.5 * found.std)  # all of six within 3.5 sigma: 99.7 %
     assert np.all(found.std < 0.02 * 0.11)  # the start is 30 % off
     bias, std = found.gyro_bias()[0]
     assert np.all(np.abs(bias - drift) < 3.5 * std)
-    assert found.fits[0].outliers >= 10  # 18 components were spoiled, some in rows that are blank
+    assert found.fits[0].outlier_count >= 10  # 18 components were spoiled, some in rows that are blank
 
 
 def test_a_log_that_was_not_used_is_predicted(identified):
     found, _ = identified
     (fit,) = found.validation
-    assert fit.white
-    assert fit.outliers == 0
-    assert 0.9 < fit.square < 1.1  # the mean of 1500 squares has a standard deviation of 0.04
+    assert fit.is_white
+    assert fit.outlier_count == 0
+    assert 0.9 < fit.mean_square < 1.1  # the mean of 1500 squares has a standard deviation of 0.04
 
 
 def test_the_identified_scenario_has_the_estimate_and_its_covariance(identified):
@@ -111,7 +111,7 @@ def test_the_verdict_on_short_logs_is_calibrated(samples):
             estimation.Fit(log, rows, filtering.Innovations(factor * value, np.ones_like(value), there[1:]), none)
             for factor in (1.0, 2.0)
         ]
-        wrong, detected = wrong + (not fits[0].white), detected + (not fits[1].white)
+        wrong, detected = wrong + (not fits[0].is_white), detected + (not fits[1].is_white)
     assert wrong <= 8  # of 200; 1 % of the verdicts are wrong, so that more has a probability of 2e-4
     assert detected == 200  # the noise is twice as large as in the model
 
@@ -132,7 +132,7 @@ def test_only_the_ratio_of_inertia_to_actuator_scale_is_determined():
     body = {"hardware": {"attitude_noise": 5e-5, "rate_noise": 1.4e-4, "torque_lag": 0.05}}
     found = explore.identify(satellite(("inertia", "actuator_scale", "gyro_bias"), **body), frame)
     assert any("only the ratio of inertia to actuator_scale" in line for line in found.undetermined)
-    assert not found.good
+    assert not found.is_identified
 
 
 @pytest.mark.long
@@ -140,7 +140,7 @@ def test_wheel_speeds_replace_the_commanded_torque():
     frame, _ = flight(np.random.default_rng(4))
     table = {"wheel_speed": ["speed1", "speed2", "speed3"], "wheel_inertia": synthetic.SPIN_INERTIA}
     found = explore.identify(satellite(telemetry=table), frame.drop("sent1", "sent2", "sent3"))
-    assert found.good, results.verdict(found)
+    assert found.is_identified, results.verdict(found)
     assert np.all(np.abs(found.estimate - ENTRIES) < 3.5 * found.std)
 
 
@@ -159,9 +159,9 @@ def test_a_mode_is_identified_from_a_simulated_run():
     off = scenario.replace(loaded, flexible__frequency=[3.3], flexible__coupling=[[0.6, 0.0, 0.0]])
     found = explore.identify(scenario.replace(off, flexible__damping=[0.01]), frame)
     true = np.array([3.0, 0.7, 0.0, 0.0, 0.0, 4.0, 0.0, 0.0, 5.0, 0.0, 6.0])
-    assert found.fits[0].white
+    assert found.fits[0].is_white
     assert np.all(np.abs(found.estimate - true) < 3.5 * found.std + 1e-12)
-    written: Any = results.identified(found)
+    written: Any = results.identified_scenario(found)
     (damping,) = written.flexible.damping
     assert damping == max(found.estimate[4], 0.0)  # an estimate of zero may be negative
 
@@ -184,7 +184,7 @@ def test_noise_of_a_star_tracker_is_about_its_own_axes():
     frame = explore.simulate(loaded, trial=3).to_polars()
     found = explore.identify(loaded, frame)
     (fit,) = found.fits
-    assert fit.white
+    assert fit.is_white
     each = np.nanmean(fit.whitened**2, axis=0)
     assert np.all(np.abs(each - 1.0) < 4.0 * np.sqrt(2.0 / len(fit.whitened)))  # 4 sigma of a mean of squares
     with pytest.raises(ScenarioError, match=r"identify.free has gyro_scale, which this scenario does not have"):

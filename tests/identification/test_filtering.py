@@ -51,23 +51,25 @@ def chain_log(rows=60, bias=0.3, walk=0.0, scale=1.0):
 def prepared(loaded, frame):
     log = telemetry.measurements(loaded, frame)
     problem = parameters.build(loaded, [log])
-    return problem, estimation.prepared(problem, log)
+    return problem, estimation.prepare_log(problem, log)
 
 
 def test_innovations_are_those_of_an_independent_kalman_filter():
     frame, t, u, y = chain_log()
     problem, (rows, kind) = prepared(chain(["actuator_scale"], torque_walk=WALK), frame)
-    found, track = jax.jit(lambda rows: filtering.filtered(problem.model, rows, kind))(jax.tree.map(jnp.asarray, rows))
+    found, track = jax.jit(lambda rows: filtering.run_filter(problem.model, rows, kind))(
+        jax.tree.map(jnp.asarray, rows)
+    )
     # exact discretisation by the matrix exponential, joint update of both readings, covariance form of Joseph
-    whitened = np.where(found.accepted, found.value / np.sqrt(found.variance), np.nan)[rows.source[1:] >= 0]
+    whitened = np.where(found.accepted, found.value / np.sqrt(found.variance), np.nan)[rows.log_row[1:] >= 0]
     z, p = np.append(y[0], 0.0), np.diag([*np.square(NOISE), 0.0])
-    expected, ends = np.full((len(t) - 1, 2), np.nan), np.flatnonzero(rows.source[1:] >= 0)
+    expected, ends = np.full((len(t) - 1, 2), np.nan), np.flatnonzero(rows.log_row[1:] >= 0)
     steps = np.append(rows.t, np.nan)
     row = 0
     for k in range(1, len(t)):
-        while rows.source[row + 1] != k:
+        while rows.log_row[row + 1] != k:
             row += 1
-        last = next(j for j in range(row, -1, -1) if rows.source[j] == k - 1)
+        last = next(j for j in range(row, -1, -1) if rows.log_row[j] == k - 1)
         for j in range(last, row + 1):
             h = steps[j + 1] - steps[j]
             f = expm(h * np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]))
@@ -107,7 +109,7 @@ def test_a_linear_gaussian_estimate_is_that_of_generalised_least_squares():
     estimate, covariance = np.linalg.lstsq(a, b, rcond=None)[0], np.linalg.inv(a.T @ a)
     np.testing.assert_allclose(found.estimate, estimate[2:], rtol=1e-6)  # the search stops at 1e-3 sigma
     np.testing.assert_allclose(found.std, np.sqrt(covariance[2, 2]), rtol=1e-6)
-    assert found.good
+    assert found.is_identified
 
 
 def test_the_gradient_of_the_likelihood_agrees_with_finite_differences():
@@ -124,7 +126,7 @@ def test_the_gradient_of_the_likelihood_agrees_with_finite_differences():
     _, gradient, information, _ = search.derivatives(z, search.logs)
     found = search.innovations(z, log)
     of_log = -0.5 * np.sum(found.accepted * (found.value**2 / found.variance + np.log(found.variance)))
-    assert value(z) == pytest.approx(of_log - 0.5 * search.known @ z**2, rel=1e-12)
+    assert value(z) == pytest.approx(of_log - 0.5 * search.prior_weight @ z**2, rel=1e-12)
     step = 1e-5
     differences = [(value(z + step * one) - value(z - step * one)) / (2.0 * step) for one in np.eye(problem.size)]
     # the truncation error of the differences is about step^2 = 1e-10, their rounding error 1e-16 * value / step
@@ -172,8 +174,8 @@ def flexible_body():
 
 def test_noise_on_the_acceleration_moves_the_modes_too():
     problem, (rows, kind) = flexible_body()
-    model = replace(problem.model, slack=jnp.asarray(0.3), modes=jnp.zeros(4))
-    _, track = filtering.filtered(model, jax.tree.map(jnp.asarray, rows), kind)
+    model = replace(problem.model, acceleration_noise=jnp.asarray(0.3), hidden_sigma=jnp.zeros(4))
+    _, track = filtering.run_filter(model, jax.tree.map(jnp.asarray, rows), kind)
     assert track is not None
     variance = np.diag(np.asarray(track.covariance)[9])[8:10]
     # white noise n on the acceleration of the body is -D n on that of the modes; other terms are of order dt
@@ -183,10 +185,10 @@ def test_noise_on_the_acceleration_moves_the_modes_too():
 
 def test_a_search_from_a_motion_that_overflows_ends_without_an_estimate():
     problem, log = flexible_body()
-    problem = replace(problem, model=replace(problem.model, modes=1e-3 * jnp.ones(4)))
+    problem = replace(problem, model=replace(problem.model, hidden_sigma=1e-3 * jnp.ones(4)))
     search = estimation.Search(problem, [log], np.inf, lambda text: None)
     start = np.append(np.zeros(6), [300.0, 0.0])  # a frequency of 3e26 rad/s
-    found = search.run(start, 0.0)
+    found = search.search_locally(start, 0.0)
     assert not found.converged
-    assert found.value == -np.inf
-    assert search.best(start, 0.0, 2).value > -np.inf  # from a random start
+    assert found.log_likelihood == -np.inf
+    assert search.find_best(start, 0.0, 2).log_likelihood > -np.inf  # from a random start

@@ -22,11 +22,11 @@ def test_fraction_interval_and_bound_equal_exact_binomial_test(successes, trials
 
 def test_fewest_trials_equal_published_tables_and_one_fewer_is_not_enough():
     """The published numbers are for the quantile 99.73 % with 90 % confidence and 0, 1 and 2 failures."""
-    assert [statistics.fewest_for(k, 0.9973, 0.9) for k in range(3)] == [852, 1440, 1970]
+    assert [statistics.fewest_trials(k, 0.9973, 0.9) for k in range(3)] == [852, 1440, 1970]
     for quantile, confidence in ((0.9973, 0.9), (0.9, 0.95), (0.5, 0.5)):
-        assert statistics.fewest_for(0, quantile, confidence) == fewest_trials(quantile, confidence)
+        assert statistics.fewest_trials(0, quantile, confidence) == fewest_trials(quantile, confidence)
         for failures in (1, 7):
-            n = statistics.fewest_for(failures, quantile, confidence)
+            n = statistics.fewest_trials(failures, quantile, confidence)
             assert must_keep(n, quantile, confidence) == n - failures
             fewer = must_keep(n - 1, quantile, confidence)
             assert fewer is None or fewer > n - 1 - failures
@@ -50,7 +50,7 @@ def test_quantile_interval_has_its_coverage_and_a_narrower_one_has_not(n, quanti
 
 def test_sample_quantile_is_an_observed_value():
     ordered = np.arange(1.0, 11.0)
-    assert [statistics.value_at(ordered, q) for q in (0.05, 0.1, 0.11, 0.5, 0.9, 0.9973, 1.0)] == [
+    assert [statistics.sample_quantile(ordered, q) for q in (0.05, 0.1, 0.11, 0.5, 0.9, 0.9973, 1.0)] == [
         1,
         1,
         2,
@@ -59,7 +59,7 @@ def test_sample_quantile_is_an_observed_value():
         10,
         10,
     ]
-    assert statistics.value_at(np.array([1.0, np.inf]), 0.9) == np.inf  # a trial without a value is infinite
+    assert statistics.sample_quantile(np.array([1.0, np.inf]), 0.9) == np.inf  # a trial without a value is infinite
 
 
 def test_sensitivities_of_a_linear_metric_equal_closed_forms():

@@ -60,7 +60,7 @@ def identify(
     from tuning.studies import identifying
 
     if design:
-        settings = {"duration": duration or 300.0, "rate": rate or designing.RATE, "torque": torque}
+        settings = {"duration": duration or 300.0, "rate": rate or designing.DEFAULT_RATE, "torque": torque}
         with store.lock_folder(folder, force=common.force):
             with progress.Progress(common.quiet) as report:
                 profile = designing.design(loaded, **settings, report=lambda text: report(text, 0, 0))
@@ -76,14 +76,14 @@ def identify(
     )
     with store.lock_folder(folder, force=common.force):
         with progress.Progress(common.quiet) as report:
-            result = estimation.of_logs(loaded, fitted, predicted, report=lambda text: report(text, 0, 0))
+            result = estimation.estimate_parameters(loaded, fitted, predicted, report=lambda text: report(text, 0, 0))
         made_by = {"logs": [str(path) for path in logs], "validate": [str(path) for path in validate]}
         store.write_folder(folder, lambda staging: identifying.write(staging, result, common.figures, made_by))
     if not common.quiet:
         terminal.print_report(
             identify_report.build(summaries.read(summaries.Identified, results.summary(result))), folder
         )
-    return 0 if result.good else 1
+    return 0 if result.is_identified else 1
 
 
 COMMANDS = (identify,)

@@ -113,7 +113,7 @@ def _quantile_rows(summary: Campaign, bad_end: str) -> list[tuple[str, ...]]:
 def driver_lines(summary: Campaign) -> Iterator[str]:
     """Return the inputs that explain the error and the required metrics best, or that none explains them.
 
-    An input is named if it explains a significant fraction of at least `statistics.EXPLAINS` of the variance.
+    An input is named if it explains a significant fraction of at least `statistics.MIN_EXPLAINED` of the variance.
     """
     unexplained = list[str]()
     for metric in dict.fromkeys(("window_error", *(one.metric for one in summary.verdicts))):
@@ -122,7 +122,7 @@ def driver_lines(summary: Campaign) -> Iterator[str]:
             name: statistics.explained_variance(msgspec.structs.asdict(driver), summary.driver_trials[metric])
             for name, driver in sensitivities.items()
         }
-        strongest = sorted((name for name in explained if explained[name] >= statistics.EXPLAINS),
+        strongest = sorted((name for name in explained if explained[name] >= statistics.MIN_EXPLAINED),
                            key=lambda name: -explained[name])[:3]  # fmt: skip
         texts = []
         for name in strongest:
@@ -135,7 +135,7 @@ def driver_lines(summary: Campaign) -> Iterator[str]:
         elif sensitivities:
             unexplained.append(metric)
     if unexplained:
-        threshold = f"{100 * statistics.EXPLAINS:g} % of the variance of the ranks"
+        threshold = f"{100 * statistics.MIN_EXPLAINED:g} % of the variance of the ranks"
         yield f"no dispersed quantity alone explains {threshold} of {', '.join(unexplained)}"
 
 

@@ -52,7 +52,7 @@ def explanation_lines(inputs: list[dict[str, Any]], plant: str) -> Iterator[str]
         if measured and value is not None:
             explained = [(statistics.explained_variance(row, row["trials"]), row) for row in measured]
             explained.sort(key=lambda pair: pair[0], reverse=True)
-            rows = [row for fraction, row in explained if fraction >= statistics.EXPLAINS]
+            rows = [row for fraction, row in explained if fraction >= statistics.MIN_EXPLAINED]
         else:
             rows.sort(key=_distance_from_median, reverse=True)
         texts = [

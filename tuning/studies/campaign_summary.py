@@ -116,7 +116,7 @@ def _verdict_entry(verdict: Verdict, requirement: Requirement, beyond: np.ndarra
         entry["fraction_bound"] = statistics.fraction_bound(within, verdict.trials, confidence)
     if requirement.quantile is not None and requirement.confidence is not None:
         failures = verdict.failures if requirement.timed is None else 0
-        entry["fewest_trials"] = statistics.fewest_for(failures, requirement.quantile, requirement.confidence)
+        entry["fewest_trials"] = statistics.fewest_trials(failures, requirement.quantile, requirement.confidence)
     return entry
 
 
@@ -150,7 +150,7 @@ def summarise(folder: Folder) -> dict[str, Any]:
             known_values = values[:DRIVER_TRIALS][has_value]
             drivers[name] = statistics.drivers(known_inputs, known_values, cached_ranks, CATEGORIES)
     simulated = int(frame.height)
-    inputs_differ = any(statistics.vary(inputs[key].to_numpy().astype(float)) for key in input_names)
+    inputs_differ = any(statistics.has_variation(inputs[key].to_numpy().astype(float)) for key in input_names)
     met = all(v["met"] for v in verdicts) if verdicts else counts["ok"] == simulated
     return {
         "status": "incomplete" if simulated < folder.trials or missing_margins else "met" if met else "not met",
@@ -202,7 +202,7 @@ def input_columns(folder: Folder, parts: list[rows.Part]) -> list[str]:
     """
     others = {
         run_tables.TRIAL,
-        *run_tables.OF_ROWS.values(),
+        *run_tables.RESULT_COLUMNS.values(),
         *run_tables.RESULTS,
         *run_tables.SAMPLES,
         *folder.custom_metric_names,
@@ -284,7 +284,7 @@ def _known_statistics(values: np.ndarray, has_value: np.ndarray) -> dict[str, An
 def _quantile_entry(sorted_values: np.ndarray, quantile: float) -> dict[str, float]:
     """Return a quantile and its confidence interval."""
     low, high = statistics.quantile_interval(sorted_values, quantile, CONFIDENCE)
-    return {"value": statistics.value_at(sorted_values, quantile), "low": low, "high": high}
+    return {"value": statistics.sample_quantile(sorted_values, quantile), "low": low, "high": high}
 
 
 def write_summary(folder: Folder, summary: dict[str, Any], figures: bool) -> None:
@@ -323,7 +323,7 @@ def worst_trials(folder: Folder, by: str, count: int) -> pl.DataFrame:
     allowed = [
         name
         for name in names
-        if name not in (run_tables.TRIAL, *run_tables.STATUS_COLUMNS, *run_tables.OF_ROWS.values())
+        if name not in (run_tables.TRIAL, *run_tables.STATUS_COLUMNS, *run_tables.RESULT_COLUMNS.values())
     ]
     if by not in allowed:
         hint = f"the head of {folder.path / 'worst.csv'}, which ptsmc worst writes without --by, has all of them"

@@ -18,7 +18,7 @@ from scipy import stats
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.figures import study_plots, style
-from ptsmc_jax.numerics.statistics import value_at, vary
+from ptsmc_jax.numerics.statistics import has_variation, sample_quantile
 from ptsmc_jax.scenario import custom, errors, free_gains, parsing, plausibility, replace, study, systems, tables
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.law_tables import LAWS, common_keys
@@ -300,7 +300,7 @@ def contender_results(contender: Contender) -> dict[str, Any]:
     settling = np.asarray(trials.metrics.settling_time)
     settled = finished & np.isfinite(settling)
     times, times_or_never = settling[settled], np.where(settled, settling, np.inf)  # infinite: the trial never settles
-    can_correlate = times.size > 2 and vary(initial_angle[settled]) and vary(times)
+    can_correlate = times.size > 2 and has_variation(initial_angle[settled]) and has_variation(times)
     mean = {name: float(np.mean(getattr(trials.metrics, name)[finished])) if finished.any() else None
             for name in ("peak_torque", "effort", "chattering")}  # fmt: skip
     return {
@@ -345,7 +345,7 @@ def _quantile(times: np.ndarray, q: float) -> float | None:
 
     A settling time is infinite if the trial never settles.
     """
-    value = value_at(np.sort(times), q)
+    value = sample_quantile(np.sort(times), q)
     return value if np.isfinite(value) else None
 
 

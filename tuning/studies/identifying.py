@@ -27,11 +27,11 @@ def write(folder: Path, identification: Identification, figures: bool, made_by: 
     """
     versions = {"command": "identify", "seed": None, **made_by, **custom.checksums(identification.scenario)}
     store.write_run_files(folder, parsing.dump(identification.scenario), versions, results.summary(identification))
-    identified = results.identified(identification)
+    identified = results.identified_scenario(identification)
     store.write_toml(folder / "identified.toml", custom_parts.copy_custom_files(parsing.dump(identified), folder))
     for k, fit in enumerate([*identification.fits, *identification.validation]):
         name = "innovations" if k == 0 else f"innovations_{k + 1}"
-        names = results.components(fit)
+        names = results.component_names(fit)
         values, sigma = results.innovations(fit)
         header = ["t", *names, *(f"{component}_sigma" for component in names)]
         store.write_csv(folder / f"{name}.csv", header, np.column_stack([fit.log.t[1:], values, sigma]).tolist())

@@ -118,7 +118,11 @@ def required_quantile(name: str, scenario: Scenario, trials: Trials) -> float:
     values = np.sort(np.asarray(getattr(trials.metrics, name))[trials.finished])
     requirement = scenario.requirements.get(name)
     fraction = (requirement.fraction if isinstance(requirement, Limit) else None) or 1.0
-    return statistics.value_at(values, min(1.0, fraction * trials.status.size / values.size)) if values.size else np.nan
+    return (
+        statistics.sample_quantile(values, min(1.0, fraction * trials.status.size / values.size))
+        if values.size
+        else np.nan
+    )
 
 
 def on_flight_clock(scenario: Scenario) -> Scenario:

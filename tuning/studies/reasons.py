@@ -34,8 +34,8 @@ def explain_worst_trials(folder: Folder, metrics: Sequence[str], count: int) -> 
     input_names = campaign_summary.input_columns(folder, parts)
     frame = rows.read(parts, ["trial", "status", *dict.fromkeys((*metrics, *input_names))]).head(folder.trials)
     inputs = {name: frame[name].to_numpy().astype(float) for name in input_names}
-    varied = {name: values for name, values in inputs.items() if statistics.vary(values)}
-    distinct = statistics.distinct({name: values for name, values in varied.items() if name not in CATEGORIES})
+    varied = {name: values for name, values in inputs.items() if statistics.has_variation(values)}
+    distinct = statistics.distinct_inputs({name: values for name, values in varied.items() if name not in CATEGORIES})
     names = [name for name in varied if name in distinct or name in CATEGORIES]
     failed = ~running.has_finished(frame)
     entries: list[dict[str, Any]] = []

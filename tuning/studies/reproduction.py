@@ -34,7 +34,7 @@ class Reproduction:
 
 def reproduce() -> Reproduction:
     """Simulate every case of the paper and check its claims."""
-    cases = claims.fly_cases()
+    cases = claims.simulate_cases()
     return Reproduction(cases, claims.claims(cases), slips.slips(cases), remark_2.measure())
 
 
@@ -47,7 +47,7 @@ def summary(reproduction: Reproduction) -> dict[str, Any]:
         "claims": [asdict(claim) for claim in reproduction.claims],
         "slips": [asdict(slip) for slip in reproduction.slips],
         "observers": [
-            {key: value for key, value in asdict(measured).items() if key not in ("t", "off")}
+            {key: value for key, value in asdict(measured).items() if key not in ("t", "error_history")}
             for measured in reproduction.observers
         ],
         "cases": {
@@ -103,7 +103,7 @@ def _plot_observers(measured: list[remark_2.Measured]) -> Figure:
     left, right = figure.subplots(1, 2)
     for kind, (colour, line) in zip(kinds, style.STYLES, strict=False):
         run = runs[kind, "smooth"]
-        left.semilogy(run.t, np.maximum(run.off, 1e-6), color=colour, ls=line, label=kind)
+        left.semilogy(run.t, np.maximum(run.error_history, 1e-6), color=colour, ls=line, label=kind)
     left.set(xlabel=style.TIME, ylabel="estimation error $|\\hat d - d|$ [N m]", xlim=(0.0, 10.0), ylim=(1e-5, 1.0))
     left.legend(ncols=2)
     for k, sign in enumerate(dict.fromkeys(run.sign for run in measured)):
@@ -136,7 +136,7 @@ def _markdown(reproduction: Reproduction) -> str:
             "",
             "# Remark 2: observers and signs, sampled at 20 Hz, t_f = 35 s, delta = 0.5 s, no noise",
             "",
-            *_markdown_table(*remark_2.rows(reproduction.observers)),
+            *_markdown_table(*remark_2.format_table(reproduction.observers)),
             "",
         ]
     )
