@@ -44,7 +44,7 @@ class Campaign:
     seed: int
     custom_metrics: CustomMetrics | None = None
     run_table: RunTable | None = None  # a row for each trial
-    software: Software = PYTHON_SOFTWARE  # the flight computer
+    software: Software = PYTHON_SOFTWARE  # flight software: the simulated law, or exported C code
 
     @property
     def table_sets_values(self) -> bool:
@@ -57,7 +57,7 @@ class Campaign:
 
     def simulate(self, trials: Sequence[int] | np.ndarray) -> pl.DataFrame:
         """Simulate these trials; return their rows."""
-        # at least as many trials as the usual program simulates, so that rows are equal to the last digit
+        # trials are repeated up to `FEW`, so that the program of the campaign simulates them, with exactly equal rows
         wanted = np.resize(np.asarray(trials, dtype=np.uint32), max(len(trials), montecarlo.FEW))
         parts, rows = self.ready.parts, self.rows(wanted)
         simulated = montecarlo.run(
@@ -69,7 +69,7 @@ class Campaign:
             "status": [status for status, _ in statuses],
             "reason": [reason for _, reason in statuses],
             "bad_time": simulated.bad_time,
-            **self._origin(wanted),
+            **self._trial_and_seed_columns(wanted),
             **{name: getattr(simulated.metrics, name) for name in self.ready.catalogue},
             **_sample_counts(simulated.samples),
             **simulated.drawn,
@@ -83,10 +83,10 @@ class Campaign:
         padded = np.resize(wanted, -(-wanted.size // PART) * PART)
         drawn = _draw(self.ready.parts, self.ready.dispersion, jnp.uint32(self.seed), self.rows(padded))
         numbers = {name: np.asarray(v)[: wanted.size] for name, v in drawn.items()}
-        return pl.DataFrame({"trial": wanted, **self._origin(wanted), **numbers})
+        return pl.DataFrame({"trial": wanted, **self._trial_and_seed_columns(wanted), **numbers})
 
-    def _origin(self, trials: np.ndarray) -> dict[str, np.ndarray]:
-        return {} if self.run_table is None else self.run_table.origin(trials)
+    def _trial_and_seed_columns(self, trials: np.ndarray) -> dict[str, np.ndarray]:
+        return {} if self.run_table is None else self.run_table.trial_and_seed_columns(trials)
 
     def custom_metric_names(self) -> list[str]:
         """Return the names of the custom metrics. Raises ValueError if they fail or a row cannot hold them."""
@@ -143,7 +143,7 @@ def from_run_table(
 
     Args:
         ready: the scenario, ready to simulate.
-        seed: of rows without a seed.
+        seed: seed of the rows that state no seed.
         table: the run table.
         custom_metrics: custom metrics.
         where: the name of the table in errors.
@@ -195,14 +195,14 @@ def missing_parts(parts: Iterable[Part], trials: int, shard: tuple[int, int] = (
 
 
 def kept_parts(parts: Iterable[Part], wanted: Iterable[Block]) -> list[Part]:
-    """Return the parts on disk that are not simulated again."""
+    """Return the parts on disk that are not among the wanted blocks, so that they are not simulated again."""
     simulated_again = {first for first, _ in wanted}
     return [part for part in parts if part.first not in simulated_again]
 
 
 @dataclass
 class Tally:
-    """The progress of a campaign."""
+    """The progress of a campaign, for progress reports."""
 
     done: int  # number of simulated trials
     total: int  # number of all trials
@@ -225,9 +225,9 @@ def has_finished(frame: pl.DataFrame) -> np.ndarray:
     return frame["status"].is_in(montecarlo.FINISHED).to_numpy()
 
 
-def verdicts(asked: Iterable[Requirement], frame: pl.DataFrame) -> list[Verdict]:
+def verdicts(required: Iterable[Requirement], frame: pl.DataFrame) -> list[Verdict]:
     """Return the verdict of each requirement over these rows; a failed trial violates all requirements."""
-    return requirements.verdicts(asked, lambda name: frame[name].to_numpy().astype(float), has_finished(frame))
+    return requirements.verdicts(required, lambda name: frame[name].to_numpy().astype(float), has_finished(frame))
 
 
 def make_parts(
@@ -237,8 +237,8 @@ def make_parts(
 
     Args:
         simulate: returns the rows of trials, by their numbers.
-        rows: the place for the parts.
-        wanted: the parts, in order.
+        rows: the folder that the parts are written into.
+        wanted: first trial and number of trials of each part, in order.
 
     Yields:
         Each part that is written, and its number of failed trials.
@@ -246,7 +246,8 @@ def make_parts(
     parts_per_group = max(1, montecarlo.block_size() * len(configure.devices()) // PART)
     groups = [wanted[k : k + parts_per_group] for k in range(0, len(wanted), parts_per_group)]
 
-    def make_group(group: list[Block]) -> list[tuple[Part, int]]:
+    def simulate_and_write(group: list[Block]) -> list[tuple[Part, int]]:
+        """Return the written parts of a group, each with its number of failed trials."""
         frame = simulate(np.concatenate([np.arange(first, first + count) for first, count in group]))
         parts, first_row = [], 0
         for first, count in group:
@@ -255,11 +256,11 @@ def make_parts(
             parts.append((rows.write(first, part), count_failures(part) if "status" in part.columns else 0))
         return parts
 
-    workers = ThreadPoolExecutor(2)  # one thread simulates while the other makes and writes rows
+    workers = ThreadPoolExecutor(2)  # one thread simulates while the other writes rows
     try:
         for group in groups[:1]:
-            yield from make_group(group)  # the first group runs alone, since it compiles the program
-        for parts in workers.map(make_group, groups[1:]):
+            yield from simulate_and_write(group)  # the first group runs alone, since it compiles the program
+        for parts in workers.map(simulate_and_write, groups[1:]):
             yield from parts
     finally:
         workers.shutdown(cancel_futures=True)
@@ -279,12 +280,12 @@ def error_history(campaign: Campaign, trials: np.ndarray) -> tuple[np.ndarray, n
     ready = campaign.ready
     rows = jax.tree.map(jnp.asarray, campaign.rows(trials))
     arguments = ready.parts, ready.dispersion, jnp.uint32(campaign.seed), rows, campaign.software
-    t, error, has_length = map(np.asarray, _history(*arguments))
+    t, error, has_length = map(np.asarray, _simulate_error_history(*arguments))
     return t[0][has_length[0]], error[:, has_length[0]]
 
 
 @programs.jit(static_argnames="software")
-def _history(
+def _simulate_error_history(
     parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Array | Row, software: Software
 ) -> tuple:
     def simulate_one(trial: jax.Array | Row) -> tuple:

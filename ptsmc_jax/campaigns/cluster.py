@@ -15,22 +15,22 @@ from ptsmc_jax.campaigns.campaign import Block, Campaign, count_failures
 from ptsmc_jax.campaigns.rows import Part, Rows
 from ptsmc_jax.campaigns.store import RefusedError
 
-ALLOWED_LOSSES = 5  # number of workers that may be lost with a part before the campaign fails
+ALLOWED_LOSSES = 5  # the campaign fails if more workers than this are lost while they simulate the same part
 _one_at_a_time = threading.Lock()  # because a part uses all devices of its process
 
 
 class Cluster:
-    """A connection to a cluster; call it with a folder and the wanted parts."""
+    """A connection to a cluster. A call with a folder and the wanted parts simulates these parts on its workers."""
 
     def __init__(self, client: Any, local: Any = None):
         self._client, self._local = client, local
 
     def __call__(self, folder: Any, wanted: list[Block]) -> Iterator[tuple[Part, int]]:
-        """Have the wanted parts simulated.
+        """Simulate the wanted parts on the workers.
 
         Args:
             folder: the campaign's folder, with `recipe()`; all workers need it at the same path.
-            wanted: the parts.
+            wanted: first trial and number of trials of each part.
 
         Yields:
             Each part on disk, and its number of failed trials.

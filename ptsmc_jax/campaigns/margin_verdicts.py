@@ -29,10 +29,10 @@ LOOP_QUANTITIES = {INERTIA, CUSTOM, INITIAL_ATTITUDE, INITIAL_RATE, INITIAL_STAT
 LOOP_QUANTITIES |= {name for name, quantity in QUANTITIES.items() if quantity.hardware}
 LOOPS_PER_CALL = 32  # loops that are simulated and linearised at once
 EXACT_PER_CALL = 16  # loops whose exact margins are computed at a time
-DELAY = "delay_margin"  # the only margin that needs commands late within a period
+DELAY = "delay_margin"  # the only margin that needs loops with a delay by a fraction of a period
 # first guess for the error of `margins.estimate`, in dB, deg, periods, dB; see `worst_margins`
 ASSUMED_ERROR = {"gain_margin": 0.06, "phase_margin": 0.12, "delay_margin": 0.2, "peak_sensitivity": 0.01}
-# values that are not interpolated: of unstable loops, and of loops that no gain or phase makes unstable
+# exact results of `margins.estimate`: the loop is unstable, or no gain or phase makes it unstable
 NOT_INTERPOLATED = (0.0, margins.LARGEST_MARGIN, -margins.LARGEST_MARGIN, 180.0, -180.0)
 
 
@@ -49,7 +49,7 @@ def judge_trials(ready: Study, seed: int, rows: np.ndarray | Row | None = None) 
 
     Args:
         ready: the scenario, ready to simulate.
-        seed: of the dispersions.
+        seed: seed of the dispersions.
         rows: rows of a run table, instead of the first trials.
 
     Returns:
@@ -66,14 +66,14 @@ def prepare(ready: Study, rows: np.ndarray | Row | None = None) -> None:
     """Start to compile the programs of `judge_trials` in the background."""
     trials = _select_trials(ready, rows)
     if trials is not None:
-        late = any(requirement.metric == DELAY for requirement in ready.margins)
-        _loops_and_margins.prepare(*_arguments(ready.parts, ready.dispersion, 0, trials, late))
+        with_delay = any(requirement.metric == DELAY for requirement in ready.margins)
+        _loops_and_margins.prepare(*_arguments(ready.parts, ready.dispersion, 0, trials, with_delay))
     elif ready.margins:
         run_margins.judged_margins_jit.prepare(ready.parts)
 
 
 def _select_trials(ready: Study, rows: np.ndarray | Row | None) -> np.ndarray | Row | None:
-    """Return the trials whose margins are required; None: only the nominal loop, or no margin is required."""
+    """Return the trials whose loops are judged; None: only the nominal loop is judged, or no margin is required."""
     table_sets_loops = isinstance(rows, Row) and not LOOP_QUANTITIES.isdisjoint(rows.given)
     if not ready.margins or not (table_sets_loops or has_different_loops(ready.dispersion)):
         return None
@@ -92,7 +92,7 @@ def has_different_loops(dispersion: Dispersion) -> bool:
 
 
 def signed_violation_ratio(value: Any, limit: Any, name: str) -> Any:
-    """Return the violation ratio of a margin. It may be negative, so that any two margins can be compared."""
+    """Return 1 for a margin at its limit, more for a violated limit, and less or a negative number on the safe side."""
     return 2.0 - value / limit if MARGINS[name].at_least else value / limit
 
 
@@ -118,19 +118,19 @@ def worst_margins(
     Args:
         parts: the nominal parts.
         dispersion: the dispersions.
-        seed: of the dispersions.
-        trials: their numbers, or rows of a run table.
-        limits: of each required margin, by name.
-        places: number of trials nearest to a limit that are exact.
+        seed: seed of the dispersions.
+        trials: numbers of the trials, or rows of a run table.
+        limits: limit of each required margin, by name.
+        places: number of trials, nearest to a limit, whose margins are exact.
 
     Returns:
         The margins by name.
     """
     names, count = tuple(limits), jax.tree.leaves(trials)[0].shape[0]
-    late = DELAY in names
-    padded_results = _loops_and_margins(*_arguments(parts, dispersion, seed, trials, late))
-    loops, rough = jax.tree.map(lambda v: np.asarray(v)[:count].reshape(-1, *v.shape[2:]), padded_results)
-    values = np.stack([rough[name] for name in names])  # (margins, loops)
+    with_delay = DELAY in names
+    padded_results = _loops_and_margins(*_arguments(parts, dispersion, seed, trials, with_delay))
+    loops, estimates = jax.tree.map(lambda v: np.asarray(v)[:count].reshape(-1, *v.shape[2:]), padded_results)
+    values = np.stack([estimates[name] for name in names])  # (margins, loops)
     limit = np.asarray([limits[name] for name in names])[:, None]
     error = np.asarray([[ASSUMED_ERROR[name] * (loops.period[0] if name == DELAY else 1.0)] for name in names]) / limit
     is_interpolated = np.isfinite(values) & ~np.isin(values, NOT_INTERPOLATED)
@@ -146,7 +146,7 @@ def worst_margins(
             return {name: _worst_value(name, v.reshape(count, -1)) for name, v in zip(names, values, strict=True)}
         chosen = np.resize(chosen, EXACT_PER_CALL)  # always the same shape, so that one program is compiled
         chosen_loops = jax.tree.map(lambda v, chosen=chosen: v[chosen], loops)
-        exact_by_name = margins.compute_each(chosen_loops, with_delay=late).by_name()
+        exact_by_name = margins.compute_each(chosen_loops, with_delay=with_delay).by_name()
         exact = np.stack([_worst_value(name, np.asarray(exact_by_name[name])) for name in names])
         deviation = np.abs(_violation_ratios(exact, limit, names) - ratios[:, chosen])
         deviation = np.where(np.isfinite(deviation), deviation, 0.0).max(axis=1, keepdims=True)
@@ -154,7 +154,7 @@ def worst_margins(
         values[:, chosen], is_interpolated[:, chosen] = exact, False
 
 
-def _arguments(parts: Parts, dispersion: Dispersion, seed: int, trials: np.ndarray | Row, late: bool) -> tuple:
+def _arguments(parts: Parts, dispersion: Dispersion, seed: int, trials: np.ndarray | Row, with_delay: bool) -> tuple:
     """Return the arguments of `_loops_and_margins`; trials are repeated to fill the last call on every device."""
     devices = len(configure.processors())
     trials_per_round = LOOPS_PER_CALL * devices
@@ -163,27 +163,27 @@ def _arguments(parts: Parts, dispersion: Dispersion, seed: int, trials: np.ndarr
         return jnp.asarray(np.resize(v, (-(-v.shape[0] // trials_per_round) * trials_per_round, *v.shape[1:])))
 
     padded_trials = jax.tree.map(pad, trials if isinstance(trials, Row) else np.asarray(trials, dtype=np.uint32))
-    return parts, dispersion, jnp.uint32(seed), padded_trials, devices, late
+    return parts, dispersion, jnp.uint32(seed), padded_trials, devices, with_delay
 
 
 def _violation_ratios(values: np.ndarray, limit: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """Return the `signed_violation_ratio` of each margin, (margins, loops); a loop without a value comes last."""
+    """Return the `signed_violation_ratio` of each margin, (margins, loops); -inf for a loop without a value."""
     ratios = np.stack([signed_violation_ratio(v, one, name) for v, one, name in zip(values, limit, names, strict=True)])
     return np.where(np.isnan(ratios), -np.inf, ratios)
 
 
 def _worst_value(name: str, values: Any) -> Any:
-    """Return the worst value along the last axis."""
+    """Return the worst value of a margin along the last axis: the smallest, or the largest of a peak sensitivity."""
     return values.min(axis=-1) if MARGINS[name].at_least else values.max(axis=-1)
 
 
-@programs.jit(static_argnames=("devices", "late"), title="the margins of many trials")
+@programs.jit(static_argnames=("devices", "with_delay"), title="the margins of many trials")
 def _loops_and_margins(
-    parts: Parts, dispersion: Dispersion, seed: Array, trials: Array | Row, devices: int, late: bool
+    parts: Parts, dispersion: Dispersion, seed: Array, trials: Array | Row, devices: int, with_delay: bool
 ) -> tuple[linear.Loop, dict[str, Array]]:
     """Return the loops of each trial, (trials, times, ..), and their interpolated margins, the worst over the axes.
 
-    late: `fractional_delays` of `linear.linearise_period`.
+    with_delay: the loops allow delays by a fraction of a period, see `linear.linearise_period`.
     """
 
     def interpolate_margins(loop: linear.Loop) -> dict[str, Array]:
@@ -194,7 +194,7 @@ def _loops_and_margins(
         return drawn, linear.simulate_nominal(drawn)
 
     def loops_of_trial(drawn: Parts, run: linear.NominalRun) -> linear.Loop:
-        return run_margins.judged_loops(drawn, run, fractional_delays=late)[0]
+        return run_margins.judged_loops(drawn, run, fractional_delays=with_delay)[0]
 
     def analyse_trials(trials: Array | Row) -> tuple[linear.Loop, dict[str, Array]]:
         loops = lapack.vmap(loops_of_trial)(*lanes.vmap(simulate_trial)(trials))

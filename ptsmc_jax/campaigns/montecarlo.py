@@ -28,7 +28,7 @@ from ptsmc_jax.simulation.metrics import Metrics
 FEW = 64  # smaller numbers of trials use a program for this many, because a step of one trial costs nearly as much
 CAPACITY = 4096  # largest number of trials in one call of a program
 BLOCK = 128  # number of trials in one block, whose states stay in the cache (benchmarks/README.md)
-BLOCK_ON_GPU = 65_536  # the same on an accelerator, where kernel launches dominate the cost of a step
+BLOCK_ON_GPU = 65_536  # `BLOCK` on an accelerator, where kernel launches dominate the cost of a step
 FINISHED = tuple(rollout.STATUS[code][0] for code in rollout.FINISHED)  # statuses of runs that reached the end
 
 
@@ -100,11 +100,11 @@ def one(
     Args:
         parts: the nominal parts.
         dispersion: the dispersions.
-        seed: of the dispersions and the noise, a whole number.
-        trial: its number, or a `Row` of a run table with a seed of its own.
+        seed: seed of the dispersions and the noise, a whole number.
+        trial: number of the trial, or a `Row` of a run table, which states its seed.
         coordinates: random numbers of the dispersions; None: those of the trial. The noise is always the trial's.
         custom_metrics: custom metrics; the run's history is recorded for them.
-        software: the flight computer.
+        software: flight software: the simulated law, or exported C code.
 
     Returns:
         Metrics, status and dispersed quantities.
@@ -144,7 +144,10 @@ def values(parts: Parts, dispersion: Dispersion, seed: WholeNumber, trial: Whole
 def _read_dispersed_values(
     dispersion: Dispersion, drawn: Parts, trial_parts: table_rows.TrialSetup, coordinates: Coordinates
 ) -> dict[str, jax.Array]:
-    """Read the quantities from the parts of a trial; add the gyro's bias and numbers of custom dispersions."""
+    """Return the dispersed quantities of a trial, its gyro bias, and the numbers of custom dispersions, by column.
+
+    `drawn` has the dispersed values. `trial_parts` has the nominal parts, the seed and the number of the trial.
+    """
     by_column = dispersion.values(drawn, set(trial_parts.given) - {RATE_BIAS})
     if dispersion.custom is not None:
         by_column |= dispersion.custom.values(coordinates[CUSTOM])
@@ -169,13 +172,13 @@ def run(
     Args:
         parts: the nominal parts.
         dispersion: the dispersions.
-        seed: of the dispersions and the noise.
-        trials: their numbers, whole numbers below 2^32, or rows of a run table.
+        seed: seed of the dispersions and the noise.
+        trials: numbers of the trials, whole numbers below 2^32, or rows of a run table.
         block: trials that a device simulates at a time; None: `block_size()`.
         custom_metrics: custom metrics, see `one`.
         kernel: whether the loop over time is one kernel, see `batching.kernel`; None: `uses_kernel()`. A
             processor interprets the kernel, slowly.
-        software: the flight computer.
+        software: flight software: the simulated law, or exported C code.
 
     Returns:
         The results, arrays (trials,).
@@ -258,7 +261,7 @@ def _program_shape(count: int, block: int | None = None) -> tuple[int, int, int]
 
 
 def prepare(parts: Parts, dispersion: Dispersion, count: int) -> None:
-    """Start to compile the program for `count` trials of such parts in the background."""
+    """Start to compile the program for `count` trials of these parts in the background."""
     shape = _program_shape(count)
     numbers = np.zeros(shape, dtype=np.uint32)
     _simulate_rows.prepare(
@@ -276,37 +279,37 @@ def _simulate_rows(
     dispersion: Dispersion,
     seed: jax.Array,
     trials: jax.Array | Row,
-    needed: jax.Array,
+    needed_rows: jax.Array,
     devices: int,
     custom_metrics: CustomMetrics | None,
     kernel: bool,
     software: Software,
 ) -> Simulated:
-    """Return the results of (devices, rows, block) trials; rows from `needed` on are zero."""
+    """Return the results of (devices, rows, block) trials; rows from `needed_rows` on are zero."""
 
     def simulate_one(trial: jax.Array | Row) -> Simulated:
         return one(parts, dispersion, seed, trial, custom_metrics=custom_metrics, software=software)
 
     result = jax.eval_shape(simulate_one, jax.tree.map(lambda v: v[0, 0, 0], trials))
     width = jax.tree.leaves(trials)[0].shape[2]
-    return evaluate_rows(lanes.vmap(simulate_one, kernel=kernel), result, width, trials, needed, devices)
+    return evaluate_rows(lanes.vmap(simulate_one, kernel=kernel), result, width, trials, needed_rows, devices)
 
 
 def evaluate_rows(
-    simulate_row: Callable, result: PyTree, width: int, rows: PyTree, needed: jax.Array, devices: int
+    simulate_row: Callable, result: PyTree, width: int, rows: PyTree, needed_rows: jax.Array, devices: int
 ) -> PyTree:
     """Evaluate one row after the other on each device.
 
     Args:
-        simulate_row: the function of a row of trials.
+        simulate_row: simulates a row of trials.
         result: shapes and types of the result of one trial; tracing a whole row for them takes long.
-        width: trials in a row.
+        width: number of trials in a row.
         rows: arrays (devices, rows, ..).
-        needed: number of rows to evaluate on each device.
+        needed_rows: number of rows to evaluate on each device.
         devices: number of devices.
 
     Returns:
-        The results, (devices, rows, width, ..); rows from `needed` on are zero.
+        The results, (devices, rows, width, ..); rows from `needed_rows` on are zero.
     """
 
     def evaluate_on_device(rows: PyTree) -> PyTree:
@@ -318,7 +321,7 @@ def evaluate_rows(
             row = simulate_row(jax.tree.map(lambda v: v[k], device_rows))
             return jax.tree.map(lambda array, v: array.at[k].set(v), results, row)
 
-        return jax.tree.map(lambda v: v[None], jax.lax.fori_loop(0, needed, step, empty))
+        return jax.tree.map(lambda v: v[None], jax.lax.fori_loop(0, needed_rows, step, empty))
 
     return map_over_devices(evaluate_on_device, rows, devices)
 

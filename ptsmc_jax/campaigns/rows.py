@@ -19,7 +19,7 @@ import polars as pl
 
 from ptsmc_jax.campaigns import store
 
-FOLDER = "trials"
+FOLDER = "trials"  # subfolder of a campaign with its parts
 RECENT_CHANGE = 1_000_000_000  # [ns] a file that changed so recently may change again with the same time of change
 _NAME = re.compile(r"(\d{10})-(\d{10})-([0-9a-f]{32})\.parquet")
 
@@ -31,10 +31,10 @@ def has_part_name(path: Path) -> bool:
 
 @dataclass(frozen=True, order=True)
 class Part:
-    """A complete part on disk."""
+    """A complete part on disk: one Parquet file with the rows of consecutive trials."""
 
     first: int  # number of the first trial
-    count: int
+    count: int  # number of trials
     path: Path
 
     @property
@@ -48,7 +48,7 @@ class Rows:
     """The parts in a folder that belong to one campaign."""
 
     folder: Path
-    key: bytes  # see `campaign_key`
+    key: bytes  # key of the checksums in the file names, see `campaign_key`
 
     def write(self, first: int, frame: pl.DataFrame) -> Part:
         """Write a part: first a temporary file, which is renamed when it is on disk."""

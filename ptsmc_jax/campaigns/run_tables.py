@@ -24,8 +24,8 @@ from ptsmc_jax.simulation.catalogues import CATALOGUE
 from ptsmc_jax.simulation.rollout import Parts
 
 ALLOWED = "a .csv or .parquet file with a row for each trial, or a folder of such .parquet files"
-ANGLE = "initial_angle"  # a column that follows from other columns
-STATUS_COLUMNS = ("status", "reason", "bad_time")  # first columns of a result
+ANGLE = "initial_angle"  # column of the initial angle, which follows from other columns
+STATUS_COLUMNS = ("status", "reason", "bad_time")  # first columns of the results of a trial
 RESULTS = {*STATUS_COLUMNS, *CATALOGUE}
 COUNT_PREFIX = "controller_"  # beginning of the columns with numbers of samples by the status that exported C returned
 SAMPLES = tuple(f"{COUNT_PREFIX}{ended}" for ended in computer.SAMPLE_STATUSES)
@@ -34,7 +34,7 @@ MOST_TRIALS = 2**32  # largest number of trials, and of seeds
 
 @dataclass(frozen=True)
 class RunTable:
-    """A checked run table, see `check_table`."""
+    """A run table that `check_table` has checked."""
 
     given: dict[str, np.ndarray]  # numbers (rows, n) by the names of `QUANTITIES`
     trial: np.ndarray | None  # (rows,) trial numbers that the table states
@@ -67,16 +67,16 @@ class RunTable:
         return Row(seeds, trial, {name: values[numbers] for name, values in self.given.items()})
 
     def row(self, number: int, seed: int) -> int | Row:
-        """Return one row, see `rows`."""
+        """Return one row: a `Row`, or only a trial number if the table sets nothing; arguments as for `rows`."""
         many = self.rows(np.asarray([number]), seed)
         return jax.tree.map(lambda v: v[0], many) if isinstance(many, Row) else int(many[0])
 
-    def without(self, same: Iterable[str]) -> "RunTable":
-        """Return the table without these quantities."""
-        return replace(self, given={name: values for name, values in self.given.items() if name not in same})
+    def without(self, quantities: Iterable[str]) -> "RunTable":
+        """Return the table without the columns of these quantities, which it then does not set."""
+        return replace(self, given={name: values for name, values in self.given.items() if name not in quantities})
 
-    def origin(self, numbers: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the columns of a campaign's rows that name the random numbers of these rows."""
+    def trial_and_seed_columns(self, numbers: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the trial numbers and seeds that the table states for these rows, by column of a campaign's rows."""
         return {RESULT_COLUMNS[name]: values[numbers] for name, values in self._random_number_columns.items()}
 
     def frame(self, parts: Parts) -> pl.DataFrame:
@@ -169,11 +169,11 @@ def check_table(
         heading = columns[0] if len(columns) == 1 else f"{_column_range(columns)} ="
         raise _row_error(where, heading, error.row, row, str(error)) from None
     stated_numbers = {}
-    for name, other in RESULT_COLUMNS.items():  # rows of a campaign name the trial in the other column
+    for name, other in RESULT_COLUMNS.items():  # the rows of a campaign state these numbers in `other`
         column = other if other in table.columns else name
         stated_numbers[name] = _whole_numbers(table, column, where) if column in table.columns else None
     if stated_numbers[TRIAL] is not None and np.array_equal(stated_numbers[TRIAL], np.arange(table.height)):
-        stated_numbers[TRIAL] = None  # the rows' own numbers are the default
+        stated_numbers[TRIAL] = None  # row k has the number k of a trial, as by default
     angle = _finite_numbers(table, ANGLE, where) if ANGLE in table.columns else None
     custom_numbers = {name: _to_numbers(table[name]) for name in drawn if name in table.columns}
     return RunTable(given, stated_numbers[TRIAL], stated_numbers[SEED], angle, table.height, custom_numbers)
@@ -214,14 +214,14 @@ def _row_error(where: str, column: str, row: int, value: object, allowed: str) -
 def _check_rows(
     is_bad: np.ndarray, where: str, column: str, values: pl.Series | np.ndarray, allowed: Callable[[int], str]
 ) -> None:
-    """Raise RefusedError for the first bad row (rows,) of a column, if any; allowed: words for the row."""
+    """Raise RefusedError for the first bad row (rows,) of a column, if any; allowed: describes the allowed values."""
     if is_bad.any():
         row = int(np.argmax(is_bad))
         raise _row_error(where, column, row, values[row], allowed(row))
 
 
 def _finite_numbers(table: pl.DataFrame, column: str, where: str) -> np.ndarray:
-    """Return a column of finite numbers."""
+    """Return a column of finite numbers, (rows,). Raises RefusedError if a cell is not a finite number."""
     numbers = _to_numbers(table[column])
     _check_rows(~np.isfinite(numbers), where, column, table[column], lambda _: "a finite number")
     return numbers
@@ -235,7 +235,7 @@ def _to_numbers(values: pl.Series) -> np.ndarray:
 
 
 def _whole_numbers(table: pl.DataFrame, column: str, where: str) -> np.ndarray:
-    """Return a column of whole numbers below 2^32."""
+    """Return a column of whole numbers below 2^32, (rows,). Raises RefusedError if a cell is not such a number."""
     values = _finite_numbers(table, column, where)
     is_bad = (values != np.floor(values)) | (values < 0) | (values >= MOST_TRIALS)
     _check_rows(is_bad, where, column, table[column], lambda _: f"a whole number from 0 to {MOST_TRIALS - 1}")

@@ -23,7 +23,7 @@ from ptsmc_jax.simulation.rollout import Log, Parts
 from ptsmc_jax.theory import lower_bound
 from ptsmc_jax.theory.lower_bound import LowerBound
 
-BOUND_TRIALS = 4  # trials whose lower bounds are pooled: they differ by a few per cent
+BOUND_TRIALS = 4  # number of trials whose lower bounds are pooled: the bounds differ by a few per cent
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Run:
 
     @property
     def has_lower_bound(self) -> bool:
-        """Whether the run has a lower bound, see `lower_bound`."""
+        """Whether the run has a lower bound: it reached its end, and its sensors have a linear model."""
         has_linear_model = self.parts.sensors.perfect or hasattr(self.parts.sensors, "measurement_model")
         return has_linear_model and self.status in montecarlo.FINISHED
 
@@ -73,13 +73,13 @@ class Run:
         blocks = {**self.parts.plant.columns(log.x), "d_hat": log.d_hat, "u": log.u, "s": log.s}
         if log.wheels is not None:
             blocks["h"], blocks["v"] = log.wheels
-        blocks |= self.parts.plant.hidden_columns(log.x) | self._measured()
+        blocks |= self.parts.plant.hidden_columns(log.x) | self._measured_columns()
         columns = {"t": np.asarray(log.t)}
         for name, block in blocks.items():
             columns |= numbered_columns(name, block)
         return columns
 
-    def _measured(self) -> dict[str, np.ndarray]:
+    def _measured_columns(self) -> dict[str, np.ndarray]:
         """Return the readings of the sensors and the torque that the computer sends, empty if they are not logged.
 
         A sample without a reading of the attitude has NaN.
@@ -113,14 +113,14 @@ def numbered_columns(name: str, block: ArrayLike) -> dict[str, np.ndarray]:
 
 
 def simulate(ready: Study, seed: int = 0, trial: int | Row | None = None, software: Software = PYTHON_SOFTWARE) -> Run:
-    """Simulate one run.
+    """Simulate one run of a scenario with its history, and judge its requirements.
 
     Args:
         ready: the scenario, ready to simulate.
-        seed: of dispersions and noise.
+        seed: seed of dispersions and noise.
         trial: the number of a trial, or a row of a run table, with its dispersions and noise. None: the nominal run
             with the noise of trial 0.
-        software: the flight computer.
+        software: flight software: the simulated law, or exported C code.
 
     Returns:
         The run with its verdicts.
@@ -151,7 +151,7 @@ def _simulate_without_margins(
 
 
 def prepare(ready: Study) -> None:
-    """Start to compile the program for one run of such a study in the background."""
+    """Start to compile the program for one run of this scenario in the background."""
     number = np.uint32(0)
     rollout.single_run_program(ready.parts).prepare(ready.parts, number, number, record=True, software=PYTHON_SOFTWARE)
 
@@ -166,7 +166,7 @@ def rms_lower_bound(ready: Study, seed: int = 0, rows: Sequence[int | Row] = ())
 
     Args:
         ready: the scenario, ready to simulate.
-        seed: of dispersions and noise.
+        seed: seed of dispersions and noise.
         rows: rows of a run table. By default the nominal run, or the first `BOUND_TRIALS` trials if the
             scenario has dispersions. The bounds of several runs are pooled.
 

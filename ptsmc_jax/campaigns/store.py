@@ -44,7 +44,7 @@ PACKAGES = ("ptsmc-jax", "jax", "jaxlib", "numpy", "scipy", "optax")
 
 
 class RefusedError(ValueError):
-    """A folder that must not be written to. Its text is one sentence."""
+    """The command refuses a folder, a file or an option. The text of the error is one sentence."""
 
 
 class InUseError(RefusedError):
@@ -206,7 +206,7 @@ def check_folder(folder: Path, force: bool) -> None:
 
 def is_empty(folder: Path) -> bool:
     """Return whether a folder is empty, except for the lock file of `lock_folder`."""
-    return all(path.name == _lock_file(folder).name for path in folder.iterdir())
+    return all(path.name == _lock_file_path(folder).name for path in folder.iterdir())
 
 
 @contextlib.contextmanager
@@ -218,7 +218,7 @@ def lock_folder(folder: Path, *, force: bool = True, shared: bool = False) -> It
 
     Args:
         folder: the result folder, which need not exist yet.
-        force: the folder may hold something already.
+        force: whether the folder may have content.
         shared: other processes that also share may write at the same time, such as the shards of a campaign.
 
     Raises:
@@ -226,7 +226,7 @@ def lock_folder(folder: Path, *, force: bool = True, shared: bool = False) -> It
         RefusedError: see `check_folder`.
     """
     check_folder(folder, force=True)  # before a folder or a file is made
-    path = _lock_file(folder)
+    path = _lock_file_path(folder)
     new_parents = [parent for parent in path.parents if not parent.exists()]
     lock = _open_locked(path, shared=shared)
     if lock is None:
@@ -245,7 +245,7 @@ def lock_folder(folder: Path, *, force: bool = True, shared: bool = False) -> It
                 parent.rmdir()
 
 
-def _lock_file(folder: Path) -> Path:
+def _lock_file_path(folder: Path) -> Path:
     folder = Path(os.path.realpath(folder))
     return _temporary_place(folder) / f".{folder.name}.lock"
 
@@ -282,7 +282,7 @@ def _lock(file: IO[str], *, shared: bool) -> bool:
 
 
 def check_file(file: Path, force: bool, option: str = "--force") -> None:
-    """Raise RefusedError if this file must not be written; option: the option for `force`."""
+    """Raise RefusedError if this file must not be written; option: name of the option that sets `force`."""
     if not file.parent.is_dir():
         raise RefusedError(
             f"the file is {file}, but {file.parent} is no folder; allowed is a file in an existing folder"

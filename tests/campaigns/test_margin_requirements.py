@@ -262,7 +262,7 @@ def test_evaluator_appends_margins_of_the_hardest_trials(drawn, monkeypatch):
     assert posed.problem.rows == ("peak_torque", "gain_margin", "peak_sensitivity")
     normalised = posed.evaluate.bounds.normalise(posed.scenario_gains)[None]
     simulated = {"gains": normalised, "f": np.zeros(1), "c": np.array([[[-0.3, -0.2, -0.4]]]), "value": np.zeros(1)}
-    monkeypatch.setattr(posed.evaluate, "_judge", lambda *_: dict(simulated))
+    monkeypatch.setattr(posed.evaluate, "_simulate_and_judge", lambda *_: dict(simulated))
     c = posed.evaluate.measure(posed.problem, normalised).c[0]
     assert c[0].tolist() == [-0.3, -0.2, -0.4] + [-1.0] * (c.shape[1] - 3)  # padded to the length of margin rows
     verdicts = margin_verdicts.judge_trials(posed.ready, 3)

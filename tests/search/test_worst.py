@@ -104,7 +104,7 @@ def test_random_attitudes_are_differentiable_with_respect_to_their_coordinates()
         return np.stack(drawn)
 
     c, by = moved(y)
-    np.testing.assert_allclose(worst._variables(problem, name, c[name]), y, rtol=1e-7)
+    np.testing.assert_allclose(worst._to_variables(problem, name, c[name]), y, rtol=1e-7)
     for k, to in enumerate(step * np.eye(3)):
         along = [
             jax.jvp(lambda c: spread.at(problem.parts, {name: c}).initial.q, (one,), (each[k],))[1]
@@ -189,7 +189,7 @@ def test_gradients_of_the_ascent_agree_with_finite_differences(what):
         limits = {"effort": 3.0, "peak_rate": 0.05}
         problem, _ = swinging(0.0, [1.0, 0.1], 0.01, **limits)
     batch = problem.batch_of(np.arange(4, 7))
-    y = np.concatenate([worst._variables(problem, name, v) for name, v in batch.coordinates.items()], axis=1)
+    y = np.concatenate([worst._to_variables(problem, name, v) for name, v in batch.coordinates.items()], axis=1)
     at = np.array([ETA, 1.0])
 
     def ratio_with_gradient(y):

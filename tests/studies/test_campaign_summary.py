@@ -23,10 +23,10 @@ FRAME = pl.DataFrame({
 ])  # fmt: skip
 def test_outcomes_distinguish_requirements_that_allow_violations_for_some_time(interpretation, outcomes, said):
     asked = Requirement("ape_z", 1.0, "rad", quantile=0.8, interpretation=interpretation)
-    assert campaign_figures._outcomes(FRAME, [asked]).tolist() == outcomes
+    assert campaign_figures._classify_trials(FRAME, [asked]).tolist() == outcomes
     torque = Requirement("peak_torque", 2.0, "N m")
     for both in ([asked, torque], [torque, asked]):  # a broken limit on trials has priority in either order
-        assert campaign_figures._outcomes(FRAME, both).tolist() == [BEYOND, *outcomes[1:]]
+        assert campaign_figures._classify_trials(FRAME, both).tolist() == [BEYOND, *outcomes[1:]]
     values, within = FRAME["ape_z"].to_numpy(), FRAME["within_ape_z"].to_numpy()
     verdict = asked.verdict(values, np.array([True, True, True, False]), within)
     assert campaign_figures._describe_time_fraction(verdict) == said

@@ -34,7 +34,7 @@ class Question:
     drawn: int  # number of values in the chart, all in one unit
     logarithmic: bool = True
     note: str = ""
-    judged: bool = False  # the table has the requirements too
+    judged: bool = False  # whether the table also shows the verdicts on the requirements
     axis_label: str = ""  # label of the chart's axis if it shows several values
     limit: str = ""  # metric whose limit the chart shows
 
@@ -52,7 +52,7 @@ def _error_angles(bounds: Interval) -> Interval:
 
 
 def _error_column(name: str, change: str) -> Value:
-    """Return the column of the error with a change that the law does not know, a key of `CHANGES`."""
+    """Return the column of the pointing error under a model error that the law does not know, a key of `CHANGES`."""
     return Value(
         name,
         "arcsec",
@@ -69,7 +69,8 @@ def _margin_column(name: str) -> Value:
     The margin is the worst of the dispersed loops if it is required, otherwise the margin of the nominal loop.
     """
 
-    def read_margin(law: Law) -> Number:
+    def read_margin_of_law(law: Law) -> Number:
+        """Return the law's margin called `name`. It is infinite if unlimited, and None if it was not computed."""
         verdict = next((entry for entry in law.verdicts if entry.metric == name), None)
         if verdict is not None:
             return math.inf if verdict.worst is None and not verdict.failures else verdict.worst
@@ -78,7 +79,7 @@ def _margin_column(name: str) -> Value:
         margin = law.margins["hold"].numbers[name]
         return math.inf if margin is None else margin  # null means that the margin is unlimited
 
-    return Value(name.removesuffix("_margin").replace("_", " "), MARGINS[name].unit, read_margin)
+    return Value(name.removesuffix("_margin").replace("_", " "), MARGINS[name].unit, read_margin_of_law)
 
 
 ERROR = Value(

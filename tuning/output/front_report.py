@@ -9,7 +9,7 @@ from tuning.output.report import Report, Section, Table, Text
 from tuning.output.run_report import warning_lines
 from tuning.studies.front import KINDS, Front, Point, metric_heading, unit_of
 
-USUAL = margins_report.USUAL_MARGINS["gain_margin"]  # limit on |S| that the summary states first [dB]
+USUAL_LIMIT = margins_report.USUAL_MARGINS["gain_margin"]  # limit on |S| that the summary states first [dB]
 
 
 def build(front: Front) -> Report:
@@ -128,7 +128,7 @@ def _margin_results(front: Front) -> Iterator[str]:
     limited = [point for point in front.points if math.isfinite(point.value)]
     within_limit = [point for point in limited if point.rms > 0.0 and _keeps_limit(point)]
     if within_limit and unlimited is not None and unlimited.rms > 0.0:
-        usual = min(within_limit, key=lambda point: abs(point.value - USUAL))
+        usual = min(within_limit, key=lambda point: abs(point.value - USUAL_LIMIT))
         error_ratio = format_ratio(usual.rms / unlimited.rms)
         yield (
             f"RMS error {format_error(usual.rms, front.plant)} with |S| at most {usual.value:g} dB, "

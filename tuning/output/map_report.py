@@ -53,7 +53,7 @@ def summary_lines(pairs: Sequence[Mapping[str, Any]], keys: tuple[str, str], pla
 
 
 def _count_failures(pair: Mapping[str, Any]) -> float:
-    """Return the number of trials of a pair that failed or did not converge at t_f."""
+    """Return how many trials of a pair failed or did not converge at t_f, as a float like all cells of map.csv."""
     return pair["failures"] + pair["not_converged"]
 
 

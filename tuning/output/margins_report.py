@@ -74,7 +74,7 @@ def _condition_lines(summary: Margins) -> Iterator[str]:
 
 
 def _open_loop_lines(summary: Margins) -> Iterator[str]:
-    """Return the inputs at which the loop is open, and the reason."""
+    """Return lines with the inputs at which the loop is open, and the reason."""
     for by_limit, reason in (
         (True, "a limit of the actuators cuts the command of the nominal run"),
         (False, "the controller does not react to the state at this sample"),

@@ -118,7 +118,7 @@ def build(folder: Path) -> str:
     except (msgspec.ValidationError, KeyError, AttributeError, TypeError) as error:
         version = result.versions.get("ptsmc-jax")
         raise RefusedError(f"{folder} holds a summary of another version ({version}): {error}; make it again") from None
-    except (csv.Error, IndexError, ValueError) as error:  # such as a table that is cut off
+    except (csv.Error, IndexError, ValueError) as error:  # for example, a CSV file is truncated
         raise RefusedError(f"{folder} holds a file that cannot be read: {error}") from None
     sections = [*report.sections, *_figure_sections(result), *_origin_sections(result)]
     charts_by_name = {
@@ -127,11 +127,11 @@ def build(folder: Path) -> str:
     drawing_script = (HERE / "page.js").read_text(encoding="utf-8")
     library = get_plotlyjs() if charts_by_name else ""
     scripts = (
-        " ".join(f"'sha256-{_checksum(script)}'" for script in (library, drawing_script))
+        " ".join(f"'sha256-{_policy_checksum(script)}'" for script in (library, drawing_script))
         if charts_by_name
         else "'none'"
     )
-    # no < in the data: nothing in it can end its element
+    # < is escaped, so that no text in the data can close the HTML element
     charts = json.dumps(charts_by_name, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string((HERE / "page.html").read_text(encoding="utf-8"))
@@ -147,7 +147,8 @@ def build(folder: Path) -> str:
     )
 
 
-def _checksum(script: str) -> str:
+def _policy_checksum(script: str) -> str:
+    """Return the SHA-256 of a script in base64, as the page's Content-Security-Policy lists allowed scripts."""
     return base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii")
 
 
@@ -240,7 +241,7 @@ def _figure_sections(result: Result) -> Iterator[Section]:
 
 
 def _origin_sections(result: Result) -> Iterator[Section]:
-    """Return the scenario, the command line, and the versions."""
+    """Return the sections with the scenario, the command line, and the versions."""
     versions = result.versions
     path = result.folder / "scenario.toml"
     if path.exists():

@@ -127,12 +127,12 @@ def _line_3d(points: np.ndarray, name: str, colour: str, width: int, dash: str =
             "line": {"color": colour, "width": width, "dash": dash}}  # fmt: skip
 
 
-def front(pareto: Front, limit: float | None) -> Chart:
-    """Return the chart of error over peak torque: the front, dominated points, and the reference gains.
+def front(pareto: Front, torque_limit: float | None) -> Chart:
+    """Return the chart of error over peak torque: the front, dominated points, reference gains and torque limit.
 
     Args:
         pareto: the front of error against torque.
-        limit: the required largest peak torque [N m].
+        torque_limit: required limit on the peak torque [N m]; None: no limit.
     """
     groups: list[tuple[str, list[Point], Chart]] = [
         ("front", pareto.non_dominated, {"mode": "lines+markers", "marker": {"size": 8}, "line": {"shape": "hv"}}),
@@ -160,7 +160,7 @@ def front(pareto: Front, limit: float | None) -> Chart:
             })  # fmt: skip
     x_axis = {"title": {"text": f"peak torque [{unit_of('peak_torque', pareto.plant)}]"}, **_DECADES}
     y_axis = {"title": {"text": f"RMS {error} in the window [{unit}]"}, **_DECADES}
-    shapes = [] if limit is None else [_vertical_line(limit, dash="dash")]
+    shapes = [] if torque_limit is None else [_vertical_line(torque_limit, dash="dash")]
     notes = []
     if pareto.lower_bound:
         least = float(convert(pareto.lower_bound))
@@ -181,8 +181,8 @@ def laws(
     """Return the chart of numbers of several laws, one below the other.
 
     Args:
-        names: of the laws.
-        series: label -> (a number for each law, its interval).
+        names: names of the laws.
+        series: by label, a number for each law and its interval.
         axis: label of the axis.
         marks: positions of vertical lines by label.
         logarithmic: use a logarithmic axis if the numbers span a decade or more.

@@ -15,7 +15,7 @@ INTERVAL = 10.0  # time between two printed lines [s]
 
 
 def format_progress(step: str, done: int, total: int, seconds: float) -> str:
-    """Return a line of progress. A total of 0: unknown.
+    """Return a line of progress. A total of 0 means that the number of steps is unknown.
 
     >>> format_progress("searching", 1, 7, 10.4), format_progress("compiling", 0, 0, 10.2)
     ('ptsmc: searching, 1 of 7, 10 s', 'ptsmc: compiling, 10 s')
@@ -32,12 +32,12 @@ class ProgressLines:
     """
 
     def __init__(self, *, silent: bool):
-        self._silent, self._begun = silent, time.monotonic()
-        self._doing, self._ended = ("compiling", 0, 0), threading.Event()
+        self._silent, self._start_time = silent, time.monotonic()
+        self._step, self._ended = ("compiling", 0, 0), threading.Event()
 
     def __enter__(self) -> Self:
         if not self._silent:
-            threading.Thread(target=self._watch, daemon=True).start()
+            threading.Thread(target=self._print_periodically, daemon=True).start()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -45,16 +45,16 @@ class ProgressLines:
 
     def __call__(self, step: str, done: int, total: int) -> None:
         """Report the current step, and the number of steps done and in all."""
-        self._doing = (step, done, total)
+        self._step = (step, done, total)
 
     def __rich__(self) -> str:
         """Return the current step, or the program that it waits for, for a column of `rich`."""
-        return _compilation_progress() or self._doing[0]
+        return _compilation_progress() or self._step[0]
 
-    def _watch(self) -> None:
+    def _print_periodically(self) -> None:
         while not self._ended.wait(INTERVAL):
-            compiling, seconds = _compilation_progress(), time.monotonic() - self._begun
-            text = format_progress(compiling, 0, 0, seconds) if compiling else format_progress(*self._doing, seconds)
+            compiling, seconds = _compilation_progress(), time.monotonic() - self._start_time
+            text = format_progress(compiling, 0, 0, seconds) if compiling else format_progress(*self._step, seconds)
             with contextlib.suppress(OSError):  # a closed pipe or a full disk is no reason to stop
                 print(text, file=sys.stderr, flush=True)
 
@@ -105,7 +105,7 @@ class Progress(Bar):
     """The progress of a search or a study with the best objective so far."""
 
     def __init__(self, quiet: bool, objective: str = "", plant: str = "spacecraft"):
-        """Begin without a step.
+        """Begin before the first step.
 
         Args:
             quiet: print nothing.
@@ -134,7 +134,7 @@ class CampaignProgress(Bar):
         self._started: tuple[float, int] | None = None
 
     def __call__(self, tally: "Tally") -> None:
-        """Report the trials so far."""
+        """Report the numbers of simulated and of failed trials so far."""
         now = time.monotonic()
         if self._started is None:
             self._started = now, tally.done

@@ -22,7 +22,7 @@ class Table:
 
     @property
     def shape(self) -> str:
-        """Return "numbers" if the last column contains numbers; columns of marks have no heading."""
+        """Return "numbers" if the last column contains numbers; a last column of remarks has no heading."""
         numbers = bool(self.head[-1]) and all(row[-1][:1] and row[-1][:1] in "-0123456789" for row in self.rows)
         return "numbers" if numbers else ""
 
@@ -48,7 +48,7 @@ class Bars:
 
     @property
     def bars(self) -> list[dict[str, Any]]:
-        """Return labels, texts and widths; the limit is at 300 of 400."""
+        """Return the label, text and width of each bar. The chart is 400 wide, and the limit is at 300."""
         return [
             {"label": entry.metric.replace("_", " "), "text": text, "met": entry.met, "limit": 300,
              "width": 400.0 if entry.margin is None else round(min(400.0, 300.0 * entry.margin), 1)}
@@ -102,7 +102,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Report:
-    """A result: what decides first, then its sections."""
+    """A result: the headline that the user decides by, the main lines, and the sections."""
 
     headline: str
     mood: str  # "good", "bad" or "calm", which selects the colour
@@ -132,8 +132,8 @@ def headline(status: str, verdicts: "Sequence[Entry]", error_text: str = "") -> 
     """Return the headline and its mood.
 
     Args:
-        status: of the summary.
-        verdicts: on the requirements.
+        status: status of the summary.
+        verdicts: verdicts on the requirements.
         error_text: the number that the user decides by, with its name; empty: there is none.
     """
     text = HEADLINES.get(status, f"the run failed: {status.replace('_', ' ')}")

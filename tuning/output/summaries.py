@@ -60,7 +60,7 @@ class Run(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Statistics(msgspec.Struct, frozen=True):
-    """A metric over the trials that ended."""
+    """Statistics of a metric over the trials that reached their end."""
 
     mean: Number
     rms: Number
@@ -69,7 +69,7 @@ class Statistics(msgspec.Struct, frozen=True):
 
 
 class Group(msgspec.Struct, frozen=True):
-    """Some gains and their trials."""
+    """A set of gains, and the results of its trials."""
 
     trials: int
     counts: dict[str, int]
@@ -78,7 +78,7 @@ class Group(msgspec.Struct, frozen=True):
     lower_bound: Number = None
 
     def number(self, metric: str, statistic: str) -> Number:
-        """Return a statistic of a metric; None without trials that have it."""
+        """Return a statistic of a metric; None if no trial has the metric."""
         statistics = self.metrics.get(metric)
         return None if statistics is None else getattr(statistics, statistic)
 
@@ -103,7 +103,7 @@ class Confirmed(msgspec.Struct, frozen=True):
 
 
 class Hardest(msgspec.Struct, frozen=True):
-    """The worst case found inside the dispersions."""
+    """The worst trial that the search found inside the support of the dispersions."""
 
     metric: str
     ratio: Number
@@ -114,7 +114,7 @@ class Hardest(msgspec.Struct, frozen=True):
 
 
 class Search(msgspec.Struct, frozen=True, kw_only=True):
-    """The record of a search."""
+    """The course and the outcome of a search for gains."""
 
     largest_over_limit: Numbers
     conflict: Numbers | None
@@ -163,7 +163,7 @@ class Trust(msgspec.Struct, frozen=True):
 
 
 class Check(msgspec.Struct, frozen=True):
-    """The result of differential evolution."""
+    """The result of differential evolution, which checks the local searches of a tuning."""
 
     value: float
     distance: float
@@ -208,7 +208,7 @@ class Tune(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Changed(msgspec.Struct, frozen=True):
-    """A law with an inertia or a delay that it does not know."""
+    """The errors of a law under an inertia or a delay that it does not know."""
 
     window_error: Number
     window_error_interval: Interval
@@ -216,7 +216,7 @@ class Changed(msgspec.Struct, frozen=True):
 
 
 class Law(msgspec.Struct, frozen=True, kw_only=True):
-    """A law of a comparison."""
+    """The gains and results of one law of a comparison."""
 
     gains: dict[str, float]
     at_bound: dict[str, str]
@@ -251,7 +251,7 @@ class Compare(msgspec.Struct, frozen=True):
 
 
 class Quantile(msgspec.Struct, frozen=True):
-    """A quantile and its interval."""
+    """A quantile of a metric and its confidence interval."""
 
     value: Number
     low: Number
@@ -259,7 +259,7 @@ class Quantile(msgspec.Struct, frozen=True):
 
 
 class Quantiles(msgspec.Struct, frozen=True):
-    """A metric over the trials of a campaign."""
+    """Quantiles and other statistics of a metric over the trials of a campaign."""
 
     without_value: int
     median: Quantile = msgspec.field(name="0.5")
@@ -271,7 +271,7 @@ class Quantiles(msgspec.Struct, frozen=True):
 
 
 class Reason(msgspec.Struct, frozen=True):
-    """The reason why trials failed."""
+    """A status and reason of failure, and the number of trials that failed for it."""
 
     status: str
     reason: str
@@ -280,7 +280,7 @@ class Reason(msgspec.Struct, frozen=True):
 
 
 class Driver(msgspec.Struct, frozen=True):
-    """The relation of a metric to an input, see `statistics.drivers`."""
+    """The correlation of a metric with a dispersed input, see `statistics.drivers`."""
 
     rank_correlation: Number
     first_order: Number
@@ -327,7 +327,7 @@ class Campaign(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Frozen(msgspec.Struct, frozen=True):
-    """The loop before the hand-over with its gains frozen."""
+    """The stability of the loop at a sample before the hand-over, with the gains frozen."""
 
     time_to_go: float
     judged: bool

@@ -14,9 +14,9 @@ def print_report(report: Report, folder: Path | str, *, earlier: bool = False) -
     """Print a report without its charts and pictures.
 
     Args:
-        report: of a result.
-        folder: of the result.
-        earlier: an earlier run wrote the result.
+        report: report of a result.
+        folder: folder of the result.
+        earlier: whether an earlier run wrote the result.
     """
     print_lines(report.headline, *report.lines)
     for title, content in report.printed():
@@ -48,7 +48,7 @@ def print_table(content: Table, **style: Any) -> None:
         rich_table.add_column(escape(name), min_width=max((_smallest_width(row[k]) for row in content.rows), default=1))
     for row in content.rows:
         rich_table.add_row(*map(RichText, row))
-    # a file or a pipe has no width; a terminal that is too narrow for the numbers breaks the lines itself
+    # A file or a pipe has no width. A terminal that is too narrow for the numbers wraps the lines itself.
     width, console = WIDE, Console()
     if console.is_terminal:
         wide_console = Console(width=WIDE)
@@ -57,7 +57,7 @@ def print_table(content: Table, **style: Any) -> None:
 
 
 def _smallest_width(cell: str) -> int:
-    """Return the smallest width of a cell: numbers, names and units are not broken, sentences at their words."""
+    """Return the smallest width of a cell. Sentences may be broken between words; numbers, names and units may not."""
     return len(cell) if len(cell) <= UNBROKEN_WIDTH else max(map(len, cell.split()))
 
 

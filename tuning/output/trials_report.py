@@ -14,11 +14,11 @@ from tuning.output.report import Table
 if TYPE_CHECKING:
     import polars as pl
 
-ROUND_OFF = 1e-9  # relative: the programs of a campaign and of a run with its history round differently
+ROUND_OFF = 1e-9  # relative difference by rounding between the programs of a campaign and of a run with its history
 
 
 def worst_trial_table(frame: "pl.DataFrame", by: str, plant: str) -> Table:
-    """Return the table of the worst trials by a metric, the worst first; plant: its kind."""
+    """Return the table of the worst trials by a metric, the worst first; plant: kind of the plant."""
     columns = ("trial", "status", by, "window_error", "peak_torque", "settling_time", "initial_angle")
     names = [name for name in dict.fromkeys(columns) if name in frame.columns]
     rows = [
@@ -41,7 +41,7 @@ def explanation_lines(inputs: list[dict[str, Any]], plant: str) -> Iterator[str]
 
     Args:
         inputs: rows of `reasons.explain_worst_trials`.
-        plant: its kind.
+        plant: kind of the plant.
     """
     from ptsmc_jax.numerics import statistics
 
@@ -86,7 +86,7 @@ def replay_lines(difference: float | None, history_difference: float, tolerance:
 
     Args:
         difference: largest relative difference from the row; None: the campaign has no row of this trial.
-        history_difference: the same of the run with its history from the replayed row.
+        history_difference: largest relative difference between the replayed row and the run with its history.
         tolerance: the largest difference that counts as equal.
     """
     if difference is None:

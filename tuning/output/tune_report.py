@@ -21,8 +21,8 @@ from tuning.output.run_report import warning_lines
 from tuning.output.summaries import Check, Entry, Group, Hardest, Search, Tune
 
 GRADIENT_TOLERANCE = 0.01  # largest relative difference of gradients from finite differences
-HOPELESS = 1.1  # see `optimise.HOPELESS`, whose import takes a second
-PUBLISHED = {  # columns of the published gains in words
+HOPELESS = 1.1  # equal to `optimise.HOPELESS`, whose import takes a second: no confirmation above this metric / limit
+PUBLISHED = {  # the published gains in words, by the heading of their column
     "published": "the published gains",
     "published, scaled": "the published gains, scaled to this body and period",
     "paper's law": "the paper's law with the published gains",
@@ -88,7 +88,7 @@ def gain_table(summary: Tune) -> Table:
 
 
 def accuracy_lines(summary: Tune) -> Iterator[str]:
-    """Return the error next to the lower bound and to the published gains."""
+    """Return lines that compare the error with the lower bound and with the error of the published gains."""
     held_out, plant = summary.held_out, summary.plant
 
     def format_rms(value: float) -> str:
@@ -146,7 +146,7 @@ def _published_comparison(summary: Tune) -> Iterator[str]:
 
 
 def search_lines(summary: Tune) -> Iterator[str]:
-    """Return the course of the search."""
+    """Return lines on the limits that the search broke, its confirmations, the worst case and the simulations."""
     record = summary.search
     violated = {
         metric: violation
@@ -237,7 +237,7 @@ def _confidence_lines(summary: Tune) -> Iterator[str]:
 
 
 def _describe_worst_case(hardest: Hardest, *, tuned_for: bool) -> str:
-    """Return the worst case inside the dispersions."""
+    """Return the worst case inside the dispersions in words."""
     where = "in the worst case inside the dispersions"
     if hardest.unbounded:
         dispersions = " and ".join(name.replace("_", " ") for name in hardest.moved) or "the dispersions"
@@ -252,7 +252,7 @@ def _describe_worst_case(hardest: Hardest, *, tuned_for: bool) -> str:
 
 
 def _evolution_comparison(check: Check, record: Search) -> str:
-    """Return the comparison with differential evolution."""
+    """Return the comparison of the tuned gains with the result of differential evolution in words."""
     keeps_limits = all(one is not None and one <= 1.0 for one in record.largest_over_limit.values())
     log_ratio = check.distance  # difference of the logarithms of the objectives
     difference = (

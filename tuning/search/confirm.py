@@ -28,7 +28,7 @@ class Count:
     metric: str
     trials: int
     violations: int
-    allowed: int | None  # largest number beyond the limit; None: too few trials to confirm the requirement
+    allowed: int | None  # largest number of trials beyond the limit; None: too few trials to confirm the requirement
     probability: float  # probability that the verdict on held-out trials is met
     surplus_violators: np.ndarray  # trials beyond the limit except for the `allowed` worst, the worst first
     band: np.ndarray  # trials ranked around the last trial that may break the limit, see `allowed_in_training`
@@ -99,12 +99,12 @@ def verdict_probability(requirement: Requirement, held_out: int, trials: int, vi
 
 
 def allowed_violations(requirement: Requirement, held_out: int, trials: int) -> int | None:
-    """Return the largest number of violations with a `verdict_probability` of at least `CONFIDENT`.
+    """Return how many counted trials may break a limit if the verdict is to be met with probability `CONFIDENT`.
 
     Args:
         requirement: the requirement.
         held_out: number of held-out trials of the verdict.
-        trials: number of counted trials.
+        trials: number of counted trials, which are simulated before the verdict.
 
     Returns:
         The number, or None if the requirement cannot be confirmed on so few trials.
@@ -126,8 +126,8 @@ def count_violations(
         problem: the tuning problem.
         requirements: the quantile requirements.
         gains: (gains,) the gains to confirm.
-        first: number of the first confirmation trial of turn 0.
-        turn: number of the turn. Each turn simulates other trials.
+        first: number of the first trial of the first confirmation.
+        turn: number of earlier confirmations. Each confirmation simulates other trials.
 
     Returns:
         The count for each requirement.

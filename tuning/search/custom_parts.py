@@ -20,7 +20,7 @@ from ptsmc_jax.onboard import sources
 from ptsmc_jax.scenario import custom, systems
 from ptsmc_jax.scenario.tables import Scenario
 
-METRICS, CONTROLLER = "--metrics", custom.CONTROLLER_OPTION  # options that name programs
+METRICS, CONTROLLER = "--metrics", custom.CONTROLLER_OPTION  # options that name custom code
 
 
 def list_custom_code(scenario: Scenario, metrics: str | None = None, controller: Path | None = None) -> dict[str, str]:
@@ -36,7 +36,7 @@ def list_custom_code(scenario: Scenario, metrics: str | None = None, controller:
 
 
 def location(key: str, where: str) -> str:
-    """Return the path of the file, or the name of the module, that would be run."""
+    """Return the path of the file with custom code, or the name of its module; key: scenario key or option."""
     return os.path.realpath(where) if key in (CONTROLLER, custom.DATA_FILE_KEY) else systems.location(where)
 
 
@@ -60,7 +60,7 @@ def allow_scenario(path: Path, scenario: Scenario, trusted: bool) -> None:
     """
     programs, folder = list_custom_code(scenario), find_results_folder(path)
     if folder is None:
-        _report(programs, path)
+        _report_custom_code(programs, path)
     else:
         allow_results(programs, path, store.read_versions(folder), trusted)
 
@@ -84,7 +84,7 @@ def allow_results(programs: Mapping[str, str], results: Path, versions: Mapping[
             "read the code, then repeat the command with --trust"
         )
     unknown = check_unchanged(programs, results, versions)
-    _report(programs, results)
+    _report_custom_code(programs, results)
     for file in _group_by_file({key: programs[key] for key in unknown}):
         print(f"ptsmc: {results} has no checksum of {file}, which may have changed since", file=sys.stderr)
 
@@ -158,7 +158,7 @@ def is_self_contained(file: Path) -> bool:
     return not uses_own_path and len(systems.list_imported_files(file, file.parent)) == 1
 
 
-def _report(programs: Mapping[str, str], source: Path) -> None:
+def _report_custom_code(programs: Mapping[str, str], source: Path) -> None:
     for file, keys in _group_by_file(programs).items():
         *first, last = keys
         name = f"{', '.join(first)} and {last} of {source} name" if first else f"{last} of {source} names"

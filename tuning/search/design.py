@@ -88,6 +88,7 @@ def shortest_time(loaded: Scenario, requirement: Requirement, seed: int, trials:
 def _predict_peaks(
     parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Array, t_f: jax.Array
 ) -> jax.Array:
+    """Return the largest commanded input along the exact motion of each trial, (trials,), without a simulation."""
     controller = replace(parts.controller, t_f=jnp.asarray(t_f, float))
 
     def peak(trial: jax.Array) -> jax.Array:

@@ -1,7 +1,6 @@
 """Evaluation of a tuning problem at many points, with a journal. `simulations` simulates and `objective` judges.
 
-`Evaluator` does the evaluation. Its results are `Measurement` and, with gradients,
-`MeasurementWithGradients`.
+`Evaluator` does the evaluation. Its results are `Measurement` and, with gradients, `MeasurementWithGradients`.
 """
 
 import re
@@ -20,7 +19,7 @@ from tuning.search.journal import Journal
 from tuning.search.normalisation import Bounds, Scale
 from tuning.search.objective import FAILED, LEAST, LIMITS, Problem, Rules, ignore_failures, judge, needed_metrics
 
-POINTS_PER_CALL = 16  # points of one call of the small compiled programs
+POINTS_PER_CALL = 16  # number of points in one call of the compiled programs below, which do not simulate
 M = TypeVar("M", bound="Measurement")
 
 
@@ -83,14 +82,18 @@ class Evaluator:
         """Return F, constraints and objective at points, (points, gains) normalised gains."""
         self.rollouts += len(normalised) * problem.trials.size
         request = _encode_request(b"values", problem, normalised)
-        return Measurement(**self._journal.get(request, lambda: self._evaluate(self._judge, problem, normalised)))
+        return Measurement(
+            **self._journal.get(request, lambda: self._evaluate(self._simulate_and_judge, problem, normalised))
+        )
 
     def measure_with_gradients(self, problem: Problem, normalised: np.ndarray) -> MeasurementWithGradients:
         """Return F, constraints and objective with gradients at points, (points, gains) normalised gains."""
         self.gradients += len(normalised) * problem.trials.size
         request = _encode_request(b"gradients", problem, normalised)
         return MeasurementWithGradients(
-            **self._journal.get(request, lambda: self._evaluate(self._judge_with_gradients, problem, normalised))
+            **self._journal.get(
+                request, lambda: self._evaluate(self._simulate_and_judge_with_gradients, problem, normalised)
+            )
         )
 
     def _evaluate(
@@ -112,7 +115,8 @@ class Evaluator:
                 values[name] = np.concatenate([pad(values[name], fill), pad(of_margins[name], fill)], axis=1)
         return _set_f_to_largest_ratio(values) if problem.objective == LIMITS else values
 
-    def _judge(self, problem: Problem, normalised: np.ndarray) -> dict[str, np.ndarray]:
+    def _simulate_and_judge(self, problem: Problem, normalised: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the fields of `Measurement` by name, without the rows of the margins."""
         gains = self._scale_gains(normalised)[0]
         values = simulations.simulate(problem.batch, gains)
         metrics = np.stack([getattr(values.metrics, name) for name in needed_metrics(problem)], axis=-1)
@@ -121,7 +125,8 @@ class Evaluator:
             **_apply_in_calls(partial(_judge_points, problem.rules), gains, metrics, np.asarray(values.status)),
         }
 
-    def _judge_with_gradients(self, problem: Problem, normalised: np.ndarray) -> dict[str, np.ndarray]:
+    def _simulate_and_judge_with_gradients(self, problem: Problem, normalised: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the fields of `MeasurementWithGradients` by name, without the rows of the margins."""
         gains, directions = self._scale_gains(normalised)
         values = simulations.simulate_with_derivatives(problem.batch, gains, directions, needed_metrics(problem))
         return {"gains": gains, **_apply_in_calls(partial(_judge_gradients, problem.rules), gains, directions, *values)}

@@ -12,8 +12,8 @@ from tuning.search.starts import STEEP, merit, sobol_points
 
 GENERATIONS = 80  # largest number of generations; `PATIENCE` can end the search earlier
 WHOLE_BOX = 64, np.inf  # points of a generation; standard deviation of the first generation, in normalised gains
-NEAR_BEST = 32, 0.05  # the same for a search from a point near the best
-PATIENCE, LEAST_DECREASE = 24, 1e-4  # the search ends if F decreases by less in `PATIENCE` generations
+NEAR_BEST = 32, 0.05  # `WHOLE_BOX` for a search from a point near the best
+PATIENCE, LEAST_DECREASE = 24, 1e-4  # the search ends if F decreases by less than this in `PATIENCE` generations
 FAILED_MERIT = 1e9  # merit of a point that failed
 
 

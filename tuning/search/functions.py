@@ -48,8 +48,8 @@ Constraints = Callable[[Float[Array, " n"]], Float[Array, "..."]]
 class Settings:
     """Numbers of points, steps and the tolerance of `minimise`."""
 
-    starts: int = 8  # starting points of local searches
-    sampled: int = 64  # candidates for starting points
+    starts: int = 8  # number of starting points of local searches
+    sampled: int = 64  # number of sampled candidates for starting points
     steps: int = 200  # largest number of evaluations with gradients from each starting point
     tolerance: float = 1e-12  # change of the objective at which a local search ends
     seed: int = 0  # seed of the sampled points
@@ -180,5 +180,5 @@ class _Problem:
 
 
 def _as_one_row(c: np.ndarray) -> np.ndarray:
-    """Return constraints as one row of `Measured.c`, (points, 1, constraints, ...), or no row if there are none."""
+    """Return constraints as one row of `Measurement.c`, (points, 1, constraints, ...), or no row if there are none."""
     return c[:, None][:, : min(1, c.shape[1])]

@@ -79,7 +79,7 @@ def design_gains(scenario: Scenario, parts: Parts, names: tuple[str, ...]) -> li
 
     Args:
         scenario: the scenario.
-        parts: its parts.
+        parts: parts of the scenario.
         names: names of the free gains.
 
     Returns:

@@ -27,7 +27,7 @@ class _HandOver:
     at: dict[str, int]  # indices of delta and t_f among the free gains
     t_f: float
     delta: float
-    period: float  # sampling period
+    period: float  # control period
 
     def with_time(self, name: str, time: float) -> np.ndarray | None:
         """Return the normalised gains with another time, or None if the time is outside its bounds."""
@@ -52,7 +52,7 @@ def _find_hand_over(problem: Problem, bounds: Bounds, normalised: np.ndarray) ->
 
 
 def points_on_samples(problem: Problem, bounds: Bounds, normalised: np.ndarray) -> list[np.ndarray]:
-    """Return points whose hand-over lies on a sample near the present hand-over.
+    """Return points whose hand-over t_f - delta is at a controller sample near the present hand-over.
 
     A flight computer hands over at its first sample at or after t_f - delta. The anchored clock of the search has a
     sample exactly at t_f - delta. Both agree only if t_f - delta is a multiple of the period.

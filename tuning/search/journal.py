@@ -42,7 +42,7 @@ class Journal:
         answer = {name: np.asarray(value) for name, value in compute().items()}
         if self._path is not None:
             with self._path.open("ab") as file:
-                file.truncate(self._end)  # removes an incomplete record, or records of other questions
+                file.truncate(self._end)  # removes an incomplete record, or records whose question differs
                 self._end += file.write(_pack_record({"question": question_checksum, **answer}))
         return answer
 

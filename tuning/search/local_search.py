@@ -19,7 +19,7 @@ ACTIVE = 1e-3  # a limit is active if c > -ACTIVE
 SLACK = 1e-4  # largest c of an admissible point
 ELASTIC = 0.1  # if c is larger at the starting point, the violation is minimised before the objective
 FAILURE_PENALTY = 1e3  # added to the relative violation for each failed trial
-F_TOLERANCE = 1e-5  # change of F at which a local search ends
+F_TOLERANCE = 1e-5  # a local search ends if F changes by less
 # Scaling of the variables. The first step is the gradient divided by the square of the scaling. It may leave the
 # neighbourhood of the starting point with 1, and stays in it with 4.
 BOLD, CAREFUL = 1.0, 4.0
@@ -114,7 +114,7 @@ class _FeasibleError(Exception):
 class Relaxed:
     """Limits whose largest violation is minimised instead of the objective."""
 
-    rows: Sequence[int] | None = None  # rows of the problem; None: all rows
+    rows: Sequence[int] | None = None  # indices of these limits among the rows of c; None: all limits
     beyond_limits: bool = False  # continue after every limit is met, to maximise the distance from the limits
 
 
@@ -216,7 +216,7 @@ class _LocalSearch:
             method="SLSQP",
             bounds=self._bounds,
             constraints=[limits] if self.at(scaled).c.shape[1] else [],
-            callback=self._accept,
+            callback=self._report_accepted,
             options={"maxiter": self._steps, "ftol": self._tolerance},
         )
         return np.clip(result.x, *np.transpose(self._bounds))
@@ -251,14 +251,15 @@ class _LocalSearch:
                 method="SLSQP",
                 bounds=[*self._bounds, (-1.0, None)],
                 constraints=[limits],
-                callback=lambda y: self._accept(y[:-1]),
+                callback=lambda y: self._report_accepted(y[:-1]),
                 options={"maxiter": self._steps, "ftol": self._tolerance},
             )
         except _FeasibleError:
             return feasible_point
         return np.clip(result.x[:-1], *np.transpose(self._bounds))
 
-    def _accept(self, scaled: np.ndarray) -> None:
+    def _report_accepted(self, scaled: np.ndarray) -> None:
+        """Call `on_accepted` with the measurement at a point that SLSQP has accepted."""
         key = np.ascontiguousarray(scaled).tobytes()
         if key in self._measurements:
             self._on_accepted(self._measurements[key])

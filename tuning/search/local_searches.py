@@ -43,10 +43,10 @@ from tuning.search.starts import (
 )
 
 CONTINUED_SEARCHES = 3  # number of local searches that a further round continues
-FIRST_TRIALS, FEWEST_AVERAGED = 32, 16  # trials of the first searches; fewest of them in the objective
+FIRST_TRIALS, FEWEST_AVERAGED = 32, 16  # number of trials of the first searches; smallest number of averaged trials
 SEARCHES_PER_DEVICE = 2  # concurrent local searches for each device, so that the device waits for SLSQP less often
 FOLLOWED_STARTS = 3  # number of explored starting points that continue with all trials
-SAME_F = 1e-4  # points are equally good if their F differs by less: 0.01 % of the objective
+SAME_F = 1e-4  # points with a smaller difference of F, 0.01 % of the objective, are equally good
 FINAL_TOLERANCE = 1e-2 * F_TOLERANCE  # for the last local search, from the best point
 CONFLICTING = 0.1  # limits whose excess is within this fraction of the largest excess count as conflicting
 HAND_OVER_ATTEMPTS = 3  # largest number of attempts with other hand-over times
@@ -57,7 +57,7 @@ SOBOL_POINTS = 512  # Sobol points of a search without gradients
 class Step:
     """A point in the history of a search."""
 
-    start: int
+    start: int  # number of the local search
     gains: np.ndarray  # (gains,)
     value: float  # objective over the training trials; NaN if no trial completes
     worst: np.ndarray  # (requirements,) largest metric / limit; infinite if a trial fails
@@ -77,7 +77,7 @@ def _few_trials(problem: Problem) -> Problem:
 
 
 class LocalSearches:
-    """The steps of a search, with its best point and its history."""
+    """The local searches of one tuning problem, run step by step, with the best point and the history so far."""
 
     def __init__(
         self,
@@ -258,21 +258,22 @@ class LocalSearches:
         tightened, bests, reports = self.tightened(problem), dict[int, Best](), 0
 
         def search(k: int, ask: Ask) -> None:
-            start, keep = contenders[k].start, partial(self._record, k)
+            start, record = contenders[k].start, partial(self._record, k)
             bests[k] = self._new_best(problem, start.normalised)
-            self._history[k] = list(contenders[k].before)  # the longer search repeats the points of the shorter one
-            search_locally(ask, bests[k], start, steps, keep, relaxed=_relaxed(problem))
+            self._history[k] = list(contenders[k].before)  # the longer search records them again
+            search_locally(ask, bests[k], start, steps, record, relaxed=_relaxed(problem))
 
-        def report_begun() -> None:
+        def report_new_searches() -> None:
+            """Report the progress once for each local search that has begun since the last call."""
             nonlocal reports
             begun = [*bests.values()] if replace_best or self._best is None else [self._best, *bests.values()]
             best = min(begun, key=lambda best: best.rank)
-            while reports < len(bests):  # one report for each local search that has begun
+            while reports < len(bests):
                 self._report(step_name, reports, len(contenders), *best.progress)
                 reports += 1
 
         def measure(points: list[np.ndarray]) -> list[MeasurementWithGradients]:
-            report_begun()
+            report_new_searches()
             measured = self._evaluate.measure_with_gradients(tightened, np.concatenate(points))
             return [measured.at(k) for k in range(len(points))]
 
@@ -280,7 +281,7 @@ class LocalSearches:
             run_in_lockstep(
                 [partial(search, k) for k in contenders], measure, SEARCHES_PER_DEVICE * len(configure.devices())
             )
-            report_begun()
+            report_new_searches()
         finally:  # also after an interrupt
             for k in contenders:
                 if k in bests:
@@ -394,6 +395,7 @@ class LocalSearches:
         return smallest_ratios
 
     def _finish(self, problem: Problem) -> None:
+        """Improve the best point: other hand-over times, a last local search, and gains reset to the scenario's."""
         self._report("last local search", 0, 1, *self.progress)
         for _ in range(HAND_OVER_ATTEMPTS):
             if not self._try_other_hand_overs(problem):
@@ -417,10 +419,11 @@ class LocalSearches:
         """
         tightened, current = self.tightened(problem), self.best
 
-        def measure_resets(changes: Sequence[Sequence[int]]) -> list[Best]:
-            resets = [np.isin(np.arange(scenario_gains.size), change) for change in changes]
+        def measure_resets(resets: Sequence[Sequence[int]]) -> list[Best]:
+            """Measure the best point with some gains reset to the scenario's values; resets: indices of these gains."""
+            masks = [np.isin(np.arange(scenario_gains.size), reset) for reset in resets]
             bounds = self._evaluate.bounds
-            changed = [bounds.with_gains(current.normalised, scenario_gains, which) for which in resets]
+            changed = [bounds.with_gains(current.normalised, scenario_gains, mask) for mask in masks]
             normalised = np.clip(changed, 0.0, 1.0)
             # with gradients, because this program is already compiled
             measured = self._evaluate.measure_with_gradients(tightened, normalised)
@@ -497,9 +500,9 @@ class LocalSearches:
             replace_best: replace the best point so far, because the problem has changed.
         """
         best, tightened = self._new_best(problem, start.normalised), self.tightened(problem)
-        measure, keep = partial(self._evaluate.measure_with_gradients, tightened), partial(self._record, number)
+        measure, record = partial(self._evaluate.measure_with_gradients, tightened), partial(self._record, number)
         try:
-            search_locally(measure, best, start, steps, keep, tolerance, _relaxed(problem))
+            search_locally(measure, best, start, steps, record, tolerance, _relaxed(problem))
         finally:  # also after an interrupt
             self._update_best(best, tightened, number, replace_best=replace_best)
 
@@ -511,6 +514,7 @@ class LocalSearches:
             self._best, self._problem, self._best_start = best, tightened, start
 
     def _record(self, start: int, measured: Measurement) -> None:
+        """Append a measured point to the history of the local search with this number."""
         worst = np.where(count_failures(measured.c)[0] > 0, np.inf, largest_ratios(measured.c, self._margin)[0])
         step = Step(start, measured.gains[0], float(measured.objective[0]), worst)
         self._history.setdefault(start, []).append(step)

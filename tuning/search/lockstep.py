@@ -42,8 +42,8 @@ class _Task:
             raise self._answer
         return self._answer
 
-    def tell(self, answer: Any) -> None:
-        """Answer the request. If the answer is an exception, it is raised inside the task."""
+    def set_answer(self, answer: Any) -> None:
+        """Set the answer to the request. If the answer is an exception, it is raised inside the task."""
         self._answer, self.is_waiting = answer, False
 
 
@@ -84,15 +84,16 @@ def run_in_lockstep(
                 condition.wait_for(all_stopped)
                 if failure is not None:
                     raise failure
-                if not any(task.has_ended for task in active):  # else another one starts and joins this batch
+                # otherwise another function starts first, and its request joins this batch
+                if not any(task.has_ended for task in active):
                     answers = answer([task.request for task in active])
                     for task, task_answer in zip(active, answers, strict=True):
-                        task.tell(task_answer)
+                        task.set_answer(task_answer)
             except BaseException as error:
                 failure = error
                 for task in active:
                     if task.is_waiting:
-                        task.tell(failure)
+                        task.set_answer(failure)
             condition.notify_all()
     if failure is not None:
         raise failure

@@ -123,14 +123,14 @@ def margin_constraints(
     Returns:
         c, (margins, entries), with an entry for each case, axis and time.
     """
-    late = margin_verdicts.DELAY in asked.metrics
+    with_delay = margin_verdicts.DELAY in asked.metrics
 
     def loops_of(parts: Parts, run: linear.NominalRun) -> Loop:
-        return run_margins.judged_loops(parts, run, fractional_delays=late)[0]
+        return run_margins.judged_loops(parts, run, fractional_delays=with_delay)[0]
 
     loops_by_case = _map_cases(asked, gains, loops_of, runs)
     loops = jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), loops_by_case)
-    values = margins.compute_each(loops, with_delay=late).by_name()
+    values = margins.compute_each(loops, with_delay=with_delay).by_name()
     ratios = [
         violation_ratio(values[name].reshape(-1), limit, at_least=MARGINS[name].at_least)
         for name, limit in zip(asked.metrics, asked.required, strict=True)
@@ -230,8 +230,8 @@ def constraints_on_devices(asked: RequiredMargins, scale: Scale, normalised: Arr
         normalised: (devices, gains) normalised gains.
     """
 
-    def on_device(normalised: Array) -> dict[str, Array]:
+    def constraints_on_device(normalised: Array) -> dict[str, Array]:
         c, gradient = constraints_with_derivatives(asked, scale, normalised[0])
         return {"c": c[None], "c_gradient": jnp.nan_to_num(gradient)[None]}
 
-    return montecarlo.map_over_devices(on_device, normalised, normalised.shape[0])
+    return montecarlo.map_over_devices(constraints_on_device, normalised, normalised.shape[0])

@@ -44,9 +44,9 @@ class Rules:
     """
 
     limits: Leaf | np.ndarray  # (requirements,) in the metrics' units
-    quantile_sample: Leaf | np.ndarray  # (requirements, trials) bool: sample of trials for a quantile
-    counted: Leaf | np.ndarray  # (requirements, trials) bool: each of these trials must keep the limit
-    averaged: int = field(metadata={"static": True})
+    quantile_sample: Leaf | np.ndarray  # (requirements, trials) bool: the trial belongs to the sample of a quantile
+    counted: Leaf | np.ndarray  # (requirements, trials) bool: the trial must keep the limit
+    averaged: int = field(metadata={"static": True})  # number of trials that the objective covers
     names: tuple[str, ...] = field(metadata={"static": True})  # names of the free gains
     # largest number of trials of the sample that may break each limit; None: a limit on every trial
     may_break: tuple[int | None, ...] = field(metadata={"static": True})
@@ -55,7 +55,7 @@ class Rules:
     tail: int | None = field(default=None, metadata={"static": True})
     # key `statistic` of [tune]; a quantile is the smallest value of the tail, the worst case has a tail of one trial
     statistic: str = field(default="rms", metadata={"static": True})
-    torque_weight: float = field(default=0.0, metadata={"static": True})
+    torque_weight: float = field(default=0.0, metadata={"static": True})  # weight of ln(RMS peak torque) in F
 
 
 @pytree
@@ -213,11 +213,14 @@ def fewer_trials(problem: Problem, averaged: int) -> Problem:
         return problem
     selected = np.r_[:averaged, problem.averaged : problem.trials.size]
 
-    def scale_count(count: int) -> int:
+    def scale_count(count: int) -> int:  # the same fraction of the fewer trials, rounded up
         return max(1, math.ceil(count * averaged / problem.averaged))
 
-    def scale_allowed(count: int | None, sample_is_averaged: bool) -> int | None:
-        return averaged - scale_count(problem.averaged - count) if count is not None and sample_is_averaged else count
+    def scale_may_break(may_break: int | None, sample_is_averaged: bool) -> int | None:
+        """Return how many of the fewer trials may break a limit. The number does not change for a band of trials."""
+        if may_break is None or not sample_is_averaged:
+            return may_break
+        return averaged - scale_count(problem.averaged - may_break)
 
     return replace(
         problem,
@@ -226,7 +229,7 @@ def fewer_trials(problem: Problem, averaged: int) -> Problem:
         counted=problem.counted[:, selected],
         coordinates={name: v[selected] for name, v in problem.coordinates.items()},
         averaged=averaged,
-        may_break=tuple(map(scale_allowed, problem.may_break, np.asarray(problem.quantile_sample)[:, 0].tolist())),
+        may_break=tuple(map(scale_may_break, problem.may_break, np.asarray(problem.quantile_sample)[:, 0].tolist())),
         tail=None if problem.tail is None else scale_count(problem.tail),
     )
 
@@ -243,7 +246,7 @@ def needed_metrics(problem: Problem) -> tuple[str, ...]:
 
 
 def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Array, Array]:
-    """Simulate all trials and return F, c, (requirements, trials), and ln of the objective, see `judge`.
+    """Simulate all trials. Return F, the constraints c, (requirements, trials), and ln(objective), see `judge`.
 
     This is a pure function for any transformation of JAX.
 
@@ -253,8 +256,8 @@ def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Arr
     """
     parts, names = with_gains(problem.parts, dict(zip(problem.names, gains, strict=True))), needed_metrics(problem)
 
-    def simulate_trial(case: tuple[Array, Coordinates]) -> tuple[Array, Array]:
-        trial, coordinates = case
+    def simulate_trial(trial_and_coordinates: tuple[Array, Coordinates]) -> tuple[Array, Array]:
+        trial, coordinates = trial_and_coordinates
         metrics, status, *_ = montecarlo.one(parts, problem.dispersion, problem.seed, trial, coordinates)
         return jnp.stack([getattr(metrics, name) for name in names]), status
 
@@ -264,7 +267,7 @@ def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Arr
 def judge(
     rules: Rules, gains: Float[Array, " gains"], metrics: Float[Array, "trials metrics"], status: Array
 ) -> tuple[Array, Array, Array]:
-    """Return F, c and ln of the objective from the metrics and statuses of all trials.
+    """Return F, which the search minimises, the constraints c, and ln(objective), from the results of all trials.
 
     c = metric / limit - 1 is met if c <= 0. The objective is one of three quantities:
 

@@ -35,7 +35,7 @@ class Settings:
     seed: int  # seed of the candidates for starting points
     with_gradients: bool = True  # whether F has useful gradients
     robust: bool = False  # whether the worst case inside the support of the dispersions is added to the constraints
-    judged: bool = True  # whether to find the worst case of the final gains, and conflicting requirements
+    judged: bool = True  # whether to find the worst case of the final gains, and requirements that conflict
     # relative tightening of the limit of each metric, if larger than the default
     margins: Mapping[str, float] = field(default_factory=dict)
     designs: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))  # (designs, gains) further starting points
@@ -108,7 +108,7 @@ def search(
         else:
             _search_without_gradients(rounds, local_searches, scenario_gains, announce)
         if settings.judged:
-            rounds.judge(local_searches.gains, announce)
+            rounds.find_worst_case(local_searches.gains, announce)
             if with_gradients and local_searches.best.violation > 0.0 and not local_searches.best.failed:
                 announce("finding the conflicting requirements")
                 conflict = local_searches.find_conflicts(rounds.problem)

@@ -62,9 +62,8 @@ class Rounds:
         self._quantiles = {k: r for k, r in enumerate(requirements) if r.quantile is not None and several}
         self._bands = [k for k in self._quantiles if not quantile_sample[k].any()]
         self.margin = SURE_MARGIN if (robust and self._on_every_trial) or not several else MARGIN
-        limits = bool(self._on_every_trial) + len(
-            self._quantiles
-        )  # number of limits that can add their hardest trials in a round
+        # number of limits that can add their hardest trials in a round
+        limits = bool(self._on_every_trial) + len(self._quantiles)
         before = problem.trials.size
         if limits:
             problem = _add_slots(problem, limits * HARDEST + SPARE_SLOTS)
@@ -72,11 +71,11 @@ class Rounds:
         self._slots = np.r_[before : problem.trials.size, problem.averaged : before]
         self.problem = _add_slots(problem, len(self._bands) * BAND_SIZE)
         self.count = 0  # number of rounds that have added harder trials or loops
-        self.hardest: Hardest | None = None  # worst case of the last gains
-        self.counts: list[confirm.Count] = []
-        self._joined = 0  # number of trials that have joined
-        self._confirmations = 0  # number of calls of `confirm.count_violations`
-        self._screening: worst_case.Screened | None = None
+        self.hardest: Hardest | None = None  # worst case of the gains of the last search
+        self.counts: list[confirm.Count] = []  # violations that the last confirmation counted
+        self._joined = 0  # number of trials that have joined the constraints
+        self._confirmations = 0  # number of calls of `confirm.count_violations`; each one simulates other trials
+        self._screening: worst_case.Screened | None = None  # screened trials of the last gains
 
     def begin(self, gains: np.ndarray) -> None:
         """Add the hardest trials and loops for approximate gains, (gains,), to the constraints."""
@@ -126,7 +125,7 @@ class Rounds:
         self.count += 1
         return True
 
-    def judge(self, gains: np.ndarray, announce: Callable[[str], None]) -> None:
+    def find_worst_case(self, gains: np.ndarray, announce: Callable[[str], None]) -> None:
         """Find the worst case of the final gains, unless it is already known.
 
         Args:
@@ -162,6 +161,7 @@ class Rounds:
         ]
 
     def _join(self, joining: Joining) -> None:
+        """Put trials into the next slots of the problem. If all slots are full, they replace the oldest trials."""
         slots = self._slots[(self._joined + np.arange(joining.trials.size)) % self._slots.size]
         self.problem = _fill_slots(self.problem, slots, joining)
         self._joined += joining.trials.size

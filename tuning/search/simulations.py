@@ -24,7 +24,7 @@ from ptsmc_jax.simulation.rollout import Parts
 from tuning.search.gains import with_gains
 
 ROW = 40  # number of trials that a program simulates together, with the same gains
-ROWS, ROWS_WITH_DERIVATIVES = 64, 8  # largest number of rows (of ROW trials) of a device in a call; with gradients
+ROWS, ROWS_WITH_DERIVATIVES = 64, 8  # largest number of rows that a device simulates in a call; with gradients
 
 
 class Batch(NamedTuple):
@@ -66,10 +66,10 @@ def simulate(batch: Batch, gains: np.ndarray) -> Simulated:
     """Simulate the trials at every point of gains, (points, gains). Return arrays (points, trials)."""
     rows = _Rows(len(gains), len(batch.trials), ROWS)
 
-    def call(arguments: dict[str, Any], needed: np.int32) -> Simulated:
-        return _simulate(*batch.shared, arguments, needed, batch.names, batch.pointing, rows.devices)
+    def simulate_rows(arguments: dict[str, Any], needed_rows: np.int32) -> Simulated:
+        return _simulate(*batch.shared, arguments, needed_rows, batch.names, batch.pointing, rows.devices)
 
-    return rows.apply(call, {"gains": gains}, batch.by_trial)
+    return rows.apply(simulate_rows, {"gains": gains}, batch.by_trial)
 
 
 def simulate_trials(batch: Batch, gains: np.ndarray) -> Trials:
@@ -100,11 +100,11 @@ def simulate_with_derivatives(
     rows, count = _Rows(len(gains), len(batch.trials), ROWS_WITH_DERIVATIVES), directions.shape[1]
     shifts = _no_shifts(batch, count) if shifts is None else shifts
 
-    def call(arguments: dict[str, Any], needed: np.int32) -> tuple[jax.Array, jax.Array]:
-        return _simulate_with_derivatives(*batch.shared, arguments, needed, batch.names, metrics, rows.devices)
+    def simulate_rows(arguments: dict[str, Any], needed_rows: np.int32) -> tuple[jax.Array, jax.Array]:
+        return _simulate_with_derivatives(*batch.shared, arguments, needed_rows, batch.names, metrics, rows.devices)
 
     by_point = {"gains": gains, "directions": directions}
-    values, derivatives = rows.apply(call, by_point, {**batch.by_trial, "shifts": dict(shifts)})
+    values, derivatives = rows.apply(simulate_rows, by_point, {**batch.by_trial, "shifts": dict(shifts)})
     return Derivatives(values[..., :-1], values[..., -1].astype(int), derivatives[..., :-1])
 
 
@@ -120,12 +120,14 @@ def prepare(batch: Batch, metrics: tuple[str, ...]) -> None:
     """Compile the programs of `simulate`, and of `simulate_with_derivatives` along all gains, in the background."""
     count, trials = len(batch.names), len(batch.trials)
     rows, gains = _Rows(1, trials, ROWS), {"gains": np.zeros((1, count))}
-    arguments, needed = rows.call_arguments(0, gains, batch.by_trial)
-    _simulate.prepare(*batch.shared, arguments, np.int32(needed), batch.names, batch.pointing, rows.devices)
+    arguments, needed_rows = rows.call_arguments(0, gains, batch.by_trial)
+    _simulate.prepare(*batch.shared, arguments, np.int32(needed_rows), batch.names, batch.pointing, rows.devices)
     rows = _Rows(1, trials, ROWS_WITH_DERIVATIVES)
     by_point = {**gains, "directions": np.zeros((1, count, count))}
-    arguments, needed = rows.call_arguments(0, by_point, {**batch.by_trial, "shifts": _no_shifts(batch, count)})
-    _simulate_with_derivatives.prepare(*batch.shared, arguments, np.int32(needed), batch.names, metrics, rows.devices)
+    arguments, needed_rows = rows.call_arguments(0, by_point, {**batch.by_trial, "shifts": _no_shifts(batch, count)})
+    _simulate_with_derivatives.prepare(
+        *batch.shared, arguments, np.int32(needed_rows), batch.names, metrics, rows.devices
+    )
 
 
 class _Rows:
@@ -152,19 +154,22 @@ class _Rows:
             by_trial: arguments with trials on the first axis.
         """
         count = min(self._rows - first, self.devices * self._max_rows)
-        places, needed = montecarlo.scatter(count, self.devices, self._max_rows)
+        places, needed_rows = montecarlo.scatter(count, self.devices, self._max_rows)
         point, row = np.divmod(first + places, len(self._trials))
         trial = self._trials[row]
         by_row = {name: np.asarray(v)[point] for name, v in by_point.items()}
-        return by_row | jax.tree.map(lambda v: np.asarray(v)[trial], by_trial), needed
+        return by_row | jax.tree.map(lambda v: np.asarray(v)[trial], by_trial), needed_rows
 
     def apply(self, program: Callable, by_point: dict[str, Any], by_trial: dict[str, Any]) -> Any:
-        """Apply a program to all rows. Return arrays (points, trials, ..)."""
+        """Apply a program to all rows. Return arrays (points, trials, ..).
+
+        The program gets the arguments of one call and the number of rows of each device that it must simulate.
+        """
         calls = []
         for first in range(0, self._rows, self.devices * self._max_rows):
-            arguments, needed = self.call_arguments(first, by_point, by_trial)
-            results = program(arguments, np.int32(needed))
-            calls.append(jax.tree.map(lambda v, needed=needed: montecarlo.gather(v, needed), results))
+            arguments, needed_rows = self.call_arguments(first, by_point, by_trial)
+            results = program(arguments, np.int32(needed_rows))
+            calls.append(jax.tree.map(lambda v, needed_rows=needed_rows: montecarlo.gather(v, needed_rows), results))
 
         def join_calls(*calls: np.ndarray) -> np.ndarray:
             rows = np.concatenate(calls)[: self._rows]
@@ -179,12 +184,12 @@ def _simulate(
     dispersion: Dispersion,
     seed: jax.Array,
     rows: dict[str, Any],
-    needed: jax.Array,
+    needed_rows: jax.Array,
     names: tuple[str, ...],
     pointing: tuple[str, ...],
     devices: int,
 ) -> Simulated:
-    """Simulate rows and return arrays (devices, rows, trials). Rows from index `needed` on are zero.
+    """Simulate rows and return arrays (devices, rows, trials). Rows from index `needed_rows` on are zero.
 
     The 52 pointing metrics make up half of the program. It therefore contains only the pointing metrics in `pointing`.
     """
@@ -203,7 +208,7 @@ def _simulate(
 
     first = jax.tree.map(lambda v: v[0, 0, 0], {name: rows[name] for name in ("trial", "coordinates")})
     result = jax.eval_shape(simulate_trial, rows["gains"][0, 0], first["trial"], first["coordinates"])
-    return montecarlo.evaluate_rows(simulate_row, result, ROW, rows, needed, devices)
+    return montecarlo.evaluate_rows(simulate_row, result, ROW, rows, needed_rows, devices)
 
 
 @programs.jit(static_argnames=("names", "metrics", "devices"), batch=True, title="the gradients of the simulations")
@@ -212,7 +217,7 @@ def _simulate_with_derivatives(
     dispersion: Dispersion,
     seed: jax.Array,
     rows: dict[str, Any],
-    needed: jax.Array,
+    needed_rows: jax.Array,
     names: tuple[str, ...],
     metrics: tuple[str, ...],
     devices: int,
@@ -235,4 +240,4 @@ def _simulate_with_derivatives(
 
     values = len(metrics) + 1
     result = jax.eval_shape(lambda: (jnp.zeros(values), jnp.zeros((rows["directions"].shape[2], values))))
-    return montecarlo.evaluate_rows(simulate_row, result, ROW, rows, needed, devices)
+    return montecarlo.evaluate_rows(simulate_row, result, ROW, rows, needed_rows, devices)

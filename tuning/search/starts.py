@@ -21,7 +21,7 @@ REPORT_EVERY = 16  # points between two reports
 PENALTY = 3.0  # F is a logarithm: a metric at twice its limit counts like 2^3 times the error
 DISTANCES = (0.5, 0.35, 0.2, 0.0)  # smallest distances in the unit cube (maximum norm), tried in this order
 STEEP = 10.0  # weight of the violation in a steep penalty, for points close to a limit
-GLOBAL_STEP = "searching the whole box"
+GLOBAL_STEP = "searching the whole box"  # name of the step in progress reports
 GLOBAL_CANDIDATES, CANDIDATES_WITH_MARGINS = 2048, 256  # points of a global search; largest number of them with margins
 NEARLY_ACTIVE = 0.05  # a limit is nearly active if c > -NEARLY_ACTIVE
 
@@ -198,7 +198,7 @@ def merit(measured: Measurement, weight: float = 1.0) -> np.ndarray:
 
 
 def penalise(f: Any, largest_c: Any, weight: float) -> Any:
-    """Return F plus a penalty on the violation, F + `PENALTY` ln(1 + times max(largest_c, 0)).
+    """Return F plus a penalty on the violation, F + `PENALTY` ln(1 + weight max(largest_c, 0)).
 
     Args:
         f: F at the points, (points,) or one number.

@@ -16,10 +16,10 @@ from tuning.search.normalisation import TIMES, Bounds
 from tuning.search.objective import Problem
 
 DIFFERENCE_STEP = 3e-4  # step of the finite differences, in normalised gains
-STEP = 1e-2  # relative step of a gain for sensitivities
+STEP = 1e-2  # step of the gains for `sensitivities`, relative to the gain
 SMALLEST_GRADIENT = 1e-6  # errors are relative to the gradient, or to this number if the gradient is smaller
 PROFILE_POINTS = 15  # number of values of a gain between its bounds, besides the final value
-FLAT = 0.01  # a quantity that changes by less than this fraction does not depend on the gain
+FLAT = 0.01  # a quantity that changes by a smaller fraction counts as independent of the gain
 CONFIDENCE = 0.95  # confidence level of intervals
 BOOTSTRAP_SAMPLES = 2000  # bootstrap samples of an interval
 
@@ -144,7 +144,7 @@ def rms(values: np.ndarray, axis: int = -1) -> Any:
 
 
 def mean(values: np.ndarray, axis: int = -1) -> Any:
-    """Return the mean along an axis."""
+    """Return the mean along an axis: the default statistic of `interval`."""
     return np.mean(values, axis=axis)
 
 
@@ -154,15 +154,15 @@ def interval(values: np.ndarray, statistic=mean) -> tuple[float, float] | None:
     The interval is bias-corrected and accelerated (Efron, JASA 82, 1987) at the level `CONFIDENCE`. It is None for
     fewer than 8 values and for equal values.
     """
-    return _bootstrap((values,), statistic, paired=False)
+    return _bootstrap_interval((values,), statistic, paired=False)
 
 
 def ratio_interval(numerator: np.ndarray, denominator: np.ndarray) -> tuple[float, float] | None:
     """Return the bootstrap interval of the ratio of two RMS over the same trials, (trials,), resampled in pairs."""
-    return _bootstrap((numerator, denominator), lambda a, b, axis=-1: rms(a, axis) / rms(b, axis), paired=True)
+    return _bootstrap_interval((numerator, denominator), lambda a, b, axis=-1: rms(a, axis) / rms(b, axis), paired=True)
 
 
-def _bootstrap(samples: tuple, statistic, *, paired: bool) -> tuple[float, float] | None:
+def _bootstrap_interval(samples: tuple, statistic, *, paired: bool) -> tuple[float, float] | None:
     if len(samples[0]) < 8 or all(np.ptp(one) == 0.0 for one in samples):
         return None
     from scipy import stats  # imported here because the import takes half a second

@@ -70,7 +70,7 @@ class Hardest:
         return not self.ratio <= 1.0 + LIMIT_TOLERANCE
 
 
-Screened = tuple[np.ndarray, np.ndarray]  # (trials,) numbers; (trials,) largest metric / limit
+Screened = tuple[np.ndarray, np.ndarray]  # (trials,) numbers of the trials; (trials,) their largest metric / limit
 
 
 def screen(problem: Problem, requirements: Sequence[Requirement], gains: np.ndarray) -> Screened:
@@ -113,7 +113,7 @@ def find_hardest(
     limits = {r.metric: r.limit for r in requirements}
     batch = problem.batch_of(chosen)
     moved = simulations.differentiable_dispersions(problem.dispersion)
-    variables = [_variables(problem, name, batch.coordinates[name]) for name in moved]
+    variables = [_to_variables(problem, name, batch.coordinates[name]) for name in moved]
     y = np.concatenate([np.zeros((chosen.size, 0)), *variables], axis=1)
     best, best_y = np.full(len(y), -np.inf), y.copy()
 
@@ -153,7 +153,7 @@ def find_hardest(
     )
 
 
-def _variables(problem: Problem, name: str, c: np.ndarray) -> np.ndarray:
+def _to_variables(problem: Problem, name: str, c: np.ndarray) -> np.ndarray:
     """Map the random numbers c of a dispersion, called coordinates, to unbounded variables y.
 
     A uniform c is (1 - cos pi y) / 2, which reaches both ends of its interval. Other c are equal to y.

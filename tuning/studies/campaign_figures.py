@@ -33,9 +33,9 @@ def build(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
     time_fractions = {v["metric"]: _describe_time_fraction(Verdict.read(v)) for v in summary["verdicts"]}
     units, spacecraft = folder.units, folder.scenario.plant.kind == "spacecraft"
 
-    def column(name: str, values: np.ndarray) -> plots.Column:
+    def plotted_column(name: str, values: np.ndarray) -> plots.Column:
         unit, limit = units.get(name, ""), limits.get(name)
-        if spacecraft and name in ERRORS:  # as an angle
+        if spacecraft and name in ERRORS:  # the norm of the error is plotted as an angle
             unit, values, limit = "rad", pointing_angle(values), None if limit is None else float(pointing_angle(limit))
         return plots.Column(unit, values, limit, time_fractions.get(name, "")).in_readable_unit()
 
@@ -44,32 +44,32 @@ def build(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
         if folder.can_simulate:  # campaigns store no histories, so the figure simulates its trials again
             figures |= _plot_fan(folder, frame, finished)
         figures["distributions"] = plots.distributions(
-            {name: column(name, np.where(finished, frame[name].to_numpy(), np.nan)) for name in names}
+            {name: plotted_column(name, np.where(finished, frame[name].to_numpy(), np.nan)) for name in names}
         )
-    outcome = _outcomes(frame, required)
+    outcome = _classify_trials(frame, required)
     totals = {name: int((outcome == name).sum()) for name in plots.MARKS}
     is_good = np.isin(outcome, ("ok", plots.AT_TIMES))
     bad_trials, good_trials = np.flatnonzero(~is_good)[: SCATTER_TRIALS // 2], np.flatnonzero(is_good)
-    # trials with problems last, so that their marks are on top
+    # failed trials and trials beyond a limit come last, so that their marks are on top
     plotted = np.concatenate([good_trials[: SCATTER_TRIALS - bad_trials.size], bad_trials])
     angle, torque = (frame[name].to_numpy().astype(float)[plotted] for name in ("initial_angle", "peak_torque"))
     if np.isfinite(torque).any():
-        angles, torques = column("initial_angle", angle), column("peak_torque", torque)
+        angles, torques = plotted_column("initial_angle", angle), plotted_column("peak_torque", torque)
         figures["torque_by_angle"] = plots.torque_by_angle(angles, torques, outcome[plotted], totals)
     drivers = summary["drivers"].get("window_error", {})
     strongest_inputs = sorted(drivers, key=lambda name: -drivers[name]["first_order"])[:4]
     if strongest_inputs:
         inputs = rows.read(parts, strongest_inputs)[plotted]
         figures["inputs"] = plots.inputs(
-            {name: column(name, inputs[name].to_numpy()) for name in strongest_inputs},
-            {name: column(name, frame[name].to_numpy()[plotted].astype(float)) for name in names[:4]},
+            {name: plotted_column(name, inputs[name].to_numpy()) for name in strongest_inputs},
+            {name: plotted_column(name, frame[name].to_numpy()[plotted].astype(float)) for name in names[:4]},
             outcome[plotted],
             totals,
         )
     return figures
 
 
-def _outcomes(frame: pl.DataFrame, required: Sequence[Requirement]) -> np.ndarray:
+def _classify_trials(frame: pl.DataFrame, required: Sequence[Requirement]) -> np.ndarray:
     """Return the outcome of each trial, a key of `plots.MARKS`, (trials,).
 
     Some requirements ask for a fraction of the time within the limit. A single trial can break such a requirement if

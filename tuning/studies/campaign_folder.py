@@ -65,13 +65,13 @@ class Folder:
     trials: int  # number of trials of the complete campaign
     custom_metrics: str | None = None  # FILE.py:NAME of the function that computes custom metrics
     bits: int = 64  # floating-point precision
-    stored_versions: CampaignVersions | None = None  # of the existing folder; None: the folder does not exist yet
+    stored_versions: CampaignVersions | None = None  # entries of the existing folder; None: it does not exist yet
     checksums: Mapping[str, str] = field(default_factory=dict)  # checksums of custom code in the existing folder
-    trusted: bool = True  # custom systems and metrics may be executed
+    trusted: bool = True  # whether custom code may be executed
     table_name: str | None = None  # file name of the run table
     table: pl.DataFrame | None = None  # content of the run table
     controller: Path | None = None  # folder of the C code that controls; None: the simulated law controls
-    first_look: int | None = None  # trials before the first check of `--until-confident`; None: one part
+    first_look: int | None = None  # number of trials before the first check of `--until-confident`; None: one part
 
     @cached_property
     def custom_code(self) -> dict[str, str]:
@@ -127,15 +127,16 @@ class Folder:
     @cached_property
     def rows(self) -> Rows:
         """The result rows of the trials."""
-        return Rows(self.path / rows.FOLDER, self._key)
+        return Rows(self.path / rows.FOLDER, self._checksum_key)
 
     @cached_property
     def dry_run_rows(self) -> Rows:
         """The dispersions of the trials, which `--dry-run` writes without simulating."""
-        return Rows(self.path / "runs", self._key)
+        return Rows(self.path / "runs", self._checksum_key)
 
     @property
-    def _key(self) -> bytes:
+    def _checksum_key(self) -> bytes:
+        """The key of the checksums in the names of the parts, so that no part of another campaign is accepted."""
         return rows.campaign_key(parsing.dump(self.scenario), self.identity)
 
     @cached_property
@@ -157,7 +158,7 @@ class Folder:
         if self.controller is None:
             return None
         if not self.can_simulate:
-            raise self._untrusted
+            raise self._untrusted_code_error
         assert self.ready is not None
         self._check_unchanged(custom_parts.CONTROLLER)
         return InTheLoop(Library(self.controller), self.ready.parts, self.ready.dispersion)
@@ -180,7 +181,7 @@ class Folder:
         return self.ready is not None and (self.controller is None or self.trusted)
 
     @property
-    def _untrusted(self) -> RefusedError:
+    def _untrusted_code_error(self) -> RefusedError:
         return RefusedError(f"{self.path} names custom code, which is run with --trust only")
 
     @cached_property
@@ -201,7 +202,7 @@ class Folder:
     def campaign_without_metrics(self) -> Campaign:
         """The campaign without custom metrics. Raises RefusedError if it needs untrusted code."""
         if self.ready is None:
-            raise self._untrusted
+            raise self._untrusted_code_error
         campaign = Campaign(self.ready, self.seed)
         if self.table is not None:
             where = f"the run table {self.table_name}"
@@ -222,7 +223,7 @@ class Folder:
     def _with_custom_metrics(self) -> Campaign:
         """The campaign with custom metrics, but without the run table."""
         if self.ready is None or (self.custom_metrics is not None and not self.trusted):
-            raise self._untrusted
+            raise self._untrusted_code_error
         if self.custom_metrics is None:
             return Campaign(self.ready, self.seed)
         self._check_unchanged(custom_parts.METRICS)
@@ -243,7 +244,7 @@ class Folder:
 
     def recipe(self) -> tuple[Callable, tuple[str, str]]:
         """Return a function and its arguments. Another process calls it to rebuild the campaign and its rows."""
-        return rebuild_campaign, (str(self.path.resolve()), self._key.hex())
+        return rebuild_campaign, (str(self.path.resolve()), self._checksum_key.hex())
 
     def intact_parts(self) -> list[Part]:
         """Return the parts of the rows. Raises RefusedError if a part is damaged, or if there are none."""
@@ -308,7 +309,7 @@ def _contains_campaign(folder: Folder, tables: Mapping[str, Any]) -> bool:
         raise RefusedError(
             f"--trials is {folder.trials}, but must be at least {earlier.trials}, the number of trials in {path}"
         )
-    new_versions = msgspec.convert(folder.versions, CampaignVersions)  # of a campaign that may not exist yet
+    new_versions = msgspec.convert(folder.versions, CampaignVersions)  # this campaign may not exist yet
     same_rows = earlier.stored_versions == new_versions and earlier.identity == folder.identity
     is_same = earlier.trials == folder.trials and same_rows
     if not is_same or earlier.controller is None:

@@ -43,7 +43,7 @@ def choose_first_look(folder: Folder, force: bool) -> int | None:
         earlier = None
     if earlier is None:
         return None
-    finished = earlier.trials < folder.trials and _existing_trials(earlier) >= earlier.trials
+    finished = earlier.trials < folder.trials and _count_existing_trials(earlier) >= earlier.trials
     return earlier.trials if finished else earlier.first_look
 
 
@@ -61,8 +61,8 @@ def until_confident(folder: Folder, width: float, simulate_first: Callable[[int]
     Returns:
         The number of trials.
     """
-    count, existing = folder.first_look or running.PART, _existing_trials(folder)
-    while count < existing:  # so that the first part has all existing trials
+    count, existing = folder.first_look or running.PART, _count_existing_trials(folder)
+    while count < existing:  # so that the first check uses all existing trials
         count *= 2
     while True:
         count = min(count, folder.trials)
@@ -74,7 +74,7 @@ def until_confident(folder: Folder, width: float, simulate_first: Callable[[int]
         count *= 2
 
 
-def _existing_trials(folder: Folder) -> int:
+def _count_existing_trials(folder: Folder) -> int:
     return sum(part.count for part in folder.rows.parts()[0])
 
 

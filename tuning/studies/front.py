@@ -12,7 +12,7 @@ from ptsmc_jax.simulation.catalogues import CATALOGUES, MARGINS
 
 
 class Kind(NamedTuple):
-    """The traded quantity of a front, in files and texts."""
+    """Names and unit of the traded quantity of a front, for files and texts."""
 
     title: str
     quantity: str
@@ -70,7 +70,7 @@ class Point:
     meets: bool = False  # whether the gains meet every requirement
     trained: float = math.nan  # objective over the training trials
     dominated: bool = False  # whether another point dominates this one, see `pareto.mark_points`
-    knee: bool = False
+    knee: bool = False  # whether the point is the knee of the front
 
     @property
     def peak(self) -> float:
@@ -98,7 +98,8 @@ class Front:
     warnings: list[str]
     published_label: str  # label of the published gains
     published_unavailable: str | None = None  # reason why the published gains cannot be simulated
-    others: dict[str, Point] = field(default_factory=dict)  # see `judging.reference_scenarios`
+    # judged reference gains, by the names of `judging.reference_scenarios`
+    others: dict[str, Point] = field(default_factory=dict)
 
     @property
     def non_dominated(self) -> list[Point]:

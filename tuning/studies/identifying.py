@@ -42,7 +42,7 @@ def write(folder: Path, identification: Identification, figures: bool, made_by: 
 
 
 def design_summary(design: Design, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of `summary.json` of a design; settings: its duration [s] and limits."""
+    """Return the content of `summary.json` of a design; settings: duration [s] and limits of the manoeuvre."""
     rows = list(design.table().iter_rows(named=True))
     return {"status": "designed", **settings, "parameters": rows, "undetermined": design.undetermined}
 
@@ -55,7 +55,7 @@ def write_design(folder: Path, scenario: Scenario, design: Design, figures: bool
         scenario: the scenario.
         design: the proposed manoeuvre.
         figures: write figures too.
-        settings: its duration [s] and limits.
+        settings: duration [s] and limits of the manoeuvre.
     """
     versions = {"command": "identify", "seed": None, "design": True, **custom.checksums(scenario)}
     store.write_run_files(folder, parsing.dump(scenario), versions, design_summary(design, settings))

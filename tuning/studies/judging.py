@@ -35,7 +35,7 @@ def derive_held_out_seed(seed: int, turn: int = 0) -> int:
 
 
 def reference_scenarios(scenario: Scenario) -> tuple[dict[str, Scenario], str | None]:
-    """Return the scenarios that tuned gains are compared with, and why the published gains cannot be simulated.
+    """Return the scenario with the published gains and with its original gains, for comparison with tuned gains.
 
     Returns:
         First a dictionary: "published" is the scenario with the published gains, and "before" is the scenario itself if
@@ -77,7 +77,7 @@ def verdicts_of(scenario: Scenario, trials: Trials, held_out_seed: int) -> list[
         held_out_seed: seed of these trials.
     """
     ready = study(on_flight_clock(scenario))
-    # a required fraction has no meaning for one nominal trial
+    # one nominal trial is judged as a number, because a required fraction of the trials has no meaning for it
     selection = 0 if trials.status.size == 1 else slice(None)
 
     def values(name: str) -> np.ndarray:
@@ -109,7 +109,7 @@ def required_quantile(name: str, scenario: Scenario, trials: Trials) -> float:
 
     Args:
         name: name of the metric.
-        scenario: its requirement defines the fraction; without a requirement the fraction is 1.
+        scenario: scenario whose requirement on the metric defines the fraction; it is 1 without a requirement.
         trials: the trials.
 
     Returns:

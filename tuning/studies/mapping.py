@@ -88,7 +88,8 @@ class Map:
 def parse_axis(text: str, option: str) -> Axis:
     """Parse an axis from KEY=LOW:HIGH:COUNT, such as controller.delta=0.05:3:9.
 
-    KEY[0] selects one element of a key with several numbers. Raises UsageError if the text is invalid.
+    The values have equal ratios if HIGH exceeds `LOGARITHMIC_SPAN` times LOW, otherwise equal differences. KEY[0]
+    selects one element of a key with several numbers. Raises UsageError if the text is invalid.
 
     Args:
         text: value of the option.

@@ -35,7 +35,7 @@ NEARLY_FEASIBLE = 0.05
 STEPS = 40  # largest number of evaluations from each starting point
 SMALLEST_DISTANCE = 1e-3  # smallest distance of two points, as a fraction of the bounds' intervals
 
-JudgedPoint = tuple[Point, Trials]
+JudgedPoint = tuple[Point, Trials]  # a point and its held-out trials
 
 
 def trace(trade: Trade, seed: int, report: Report = lambda *_: None, journal: Journal | None = None) -> Front:
@@ -76,7 +76,7 @@ def trace(trade: Trade, seed: int, report: Report = lambda *_: None, journal: Jo
         trials=judged[0][1].status.size if judged else 0,
         seed=held_out_seed,
         interval_confidence=trust.CONFIDENCE,
-        lower_bound=None if overrides else judging.rms_lower_bound(scenario, held_out_seed),  # depends on t_f
+        lower_bound=None if overrides else judging.rms_lower_bound(scenario, held_out_seed),  # the bound depends on t_f
         rollouts=setup.evaluate.rollouts,
         gradients=setup.evaluate.gradients,
         requirements=list(scenario.requirements),

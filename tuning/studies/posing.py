@@ -146,19 +146,19 @@ def tuning_reach(scenario: Scenario, table: tables.Tune, **overrides: float) -> 
     """Return the ranges of the free gains that one compiled program must cover.
 
     Args:
-        scenario: its gains are in the ranges.
-        table: its bounds are in the ranges.
+        scenario: scenario whose gains the ranges include.
+        table: table [tune] whose bounds the ranges include.
         overrides: fields of `Reach` that get other values.
     """
     scenario_reach = reach_of(scenario)
 
-    def interval(name: str, lower: float, upper: float | None = None) -> tuple[float, float]:
+    def range_of_gain(name: str, lower: float, upper: float | None = None) -> tuple[float, float]:
         low, high = table.bounds.get(name, (lower, lower))
         return min(low, lower), max(high, lower if upper is None else upper)
 
-    smallest_delta, delta = interval("delta", scenario_reach.delta)
-    smallest_t_f, t_f = interval("t_f", scenario_reach.t_f)
-    gain, largest_gain = interval("observer_gain", scenario_reach.gain, scenario_reach.largest_gain)
+    smallest_delta, delta = range_of_gain("delta", scenario_reach.delta)
+    smallest_t_f, t_f = range_of_gain("t_f", scenario_reach.t_f)
+    gain, largest_gain = range_of_gain("observer_gain", scenario_reach.gain, scenario_reach.largest_gain)
     covered = dataclasses.replace(
         scenario_reach,
         smallest_t_f=smallest_t_f,
@@ -167,9 +167,9 @@ def tuning_reach(scenario: Scenario, table: tables.Tune, **overrides: float) -> 
         smallest_delta=smallest_delta,
         gain=gain,
         largest_gain=largest_gain,
-        k1=interval("k1", scenario_reach.k1)[1],
-        sign_width=interval("sign_width", scenario_reach.sign_width)[0],
-        surface_rate=interval("surface_rate", scenario_reach.surface_rate)[1],
+        k1=range_of_gain("k1", scenario_reach.k1)[1],
+        sign_width=range_of_gain("sign_width", scenario_reach.sign_width)[0],
+        surface_rate=range_of_gain("surface_rate", scenario_reach.surface_rate)[1],
     )
     return dataclasses.replace(covered, **overrides)
 

@@ -29,7 +29,7 @@ def summary(run: Run, scenario: Scenario, computer: "InTheLoop | None" = None) -
 
     Args:
         run: the simulated run.
-        scenario: its scenario.
+        scenario: scenario of the run.
         computer: the C code that controlled the run; None: the simulated law did.
     """
     verdicts = {

@@ -102,9 +102,10 @@ def summary(ready: Study, course: Course) -> dict[str, Any]:
         }
 
     def open_inputs(k: int) -> dict[str, list[str]]:
+        """Return the inputs with an open loop at sample k, and those of them that an actuator limit opens."""
         loop_margins, new = jax.tree.map(lambda v: v[k], (course.at_input, course.loops.new))
         is_open = _is_open(loop_margins)
-        has_no_effect = is_open & ~np.any(new[0], axis=0)  # the command has no effect on the plant
+        has_no_effect = is_open & ~np.any(new[0], axis=0)  # no state depends on the command: an actuator limit cuts it
         return {key: [name for name, selected in zip(inputs, masks, strict=True) if selected]
                 for key, masks in (("open", is_open), ("cut", has_no_effect))}  # fmt: skip
 
@@ -162,7 +163,7 @@ def write(folder: Path, ready: Study, course: Course, figures: bool) -> None:
     Args:
         folder: an empty folder.
         ready: the scenario, ready to simulate.
-        course: its margins.
+        course: margins along the nominal run.
         figures: write figures too.
     """
     scenario = ready.scenario

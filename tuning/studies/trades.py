@@ -35,7 +35,7 @@ FEWER_STARTS = 4  # number of starting points of a search whose gains are refine
 LIMITS = (3.0, 4.0, 5.0, 6.0, 8.0, 12.0)  # default limits on the peak sensitivity [dB]
 BOUNDED = ("gain_margin", "phase_margin", SENSITIVITY)  # margins that a limit on the peak sensitivity bounds
 SPAN = (0.5, 0.7, 1.0, 1.4, 2.0)  # default prescribed times, relative to the scenario's t_f
-# metrics that a faster slew may increase
+# metrics that usually grow if t_f gets shorter; a front against t_f reports them as its costs
 SLEW_COSTS = ("peak_torque", "peak_momentum", "peak_wheel_torque", "peak_wheel_momentum", "peak_rate", "effort")
 
 
@@ -141,7 +141,7 @@ class Torque(Trade):
         return self.scenario if limited else _with_requirements(self.scenario, {TORQUE: INACTIVE_LIMIT})
 
     def targets(self, setup: TuningSetup, report: Report) -> tuple[list[Target], list[np.ndarray]]:
-        """Search without a limit, for the least torque, and for a limit between both; see `Trade.targets`."""
+        """Search without a torque limit, for the least torque, and with a limit in between; see `Trade.targets`."""
         index = setup.problem.metrics.index(TORQUE)
 
         def limited_problem(limit: float, base: Problem = setup.problem) -> Problem:
@@ -178,7 +178,7 @@ class Torque(Trade):
         return {TORQUE: judging.required_quantile(TORQUE, tuned, trials), "mean_peak_torque": mean}
 
     def options(self) -> dict[str, Any]:
-        """Return the option --points."""
+        """Return the option --points of `ptsmc pareto`, by name."""
         return {"points": self.points}
 
 
@@ -235,7 +235,7 @@ class Margins(Trade):
         return {TORQUE: judging.required_quantile(TORQUE, tuned, trials)} | {v.metric: v.worst for v in verdicts}
 
     def options(self) -> dict[str, Any]:
-        """Return the options --against and --limits."""
+        """Return the options --against and --limits of `ptsmc pareto`, by name."""
         return {"against": self.against, "limits": _join_values(self.values[1:])}
 
 
@@ -318,7 +318,7 @@ class SlewTime(Trade):
         return {name: judging.required_quantile(name, tuned, trials) for name in has}
 
     def options(self) -> dict[str, Any]:
-        """Return the options --against and --times."""
+        """Return the options --against and --times of `ptsmc pareto`, by name."""
         return {"against": self.against, "times": _join_values(self.values)}
 
 

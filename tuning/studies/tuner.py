@@ -119,7 +119,7 @@ class _Judged:
     seed: int  # seed of the held-out trials
     trials: Trials
     verdicts: list[Verdict]
-    begun: float  # time of the monotonic clock after the search [s]
+    search_end: float  # time of the monotonic clock at the end of the search [s]
 
 
 def tune(
@@ -144,8 +144,8 @@ def tune(
         report: called with the progress after every step.
         journal: evaluations of an interrupted run, which then resumes.
         with_global_check: compare the result with a global search (differential evolution).
-        with_checks: compute gradient checks, profiles, sensitivities and margins of the result too.
-        tries: largest number of searches.
+        with_checks: also check the gradients, and compute profiles, sensitivities and margins of the result.
+        tries: largest number of searches. A search is repeated if its gains break a limit on the held-out trials.
 
     Returns:
         The gains, and their results on training and held-out trials.
@@ -199,7 +199,7 @@ def tune(
         check=check,
         rollouts=rollouts,
         gradients=gradients,
-        seconds=judged.begun - started,
+        seconds=judged.search_end - started,
     )
 
 
@@ -279,13 +279,12 @@ def _relevant_bounds(setup: TuningSetup, outcome: Search, sides: dict[str, str])
 
 def _judge_outcome(scenario: Scenario, setup: TuningSetup, outcome: Search, held_out_seed: int) -> _Judged:
     """Simulate the rounded gains of a search on held-out trials."""
-    begun = time.monotonic()
+    search_end = time.monotonic()
     rounded = setup.rounded_gains(outcome.normalised)
     simulated = judging.on_flight_clock(gains.in_scenario(scenario, rounded))
     trials = judging.judge(simulated, held_out_seed)
-    return _Judged(
-        outcome, rounded, simulated, held_out_seed, trials, judging.verdicts_of(simulated, trials, held_out_seed), begun
-    )
+    verdicts = judging.verdicts_of(simulated, trials, held_out_seed)
+    return _Judged(outcome, rounded, simulated, held_out_seed, trials, verdicts, search_end)
 
 
 def _find_shortest_time(setup: TuningSetup, judged: _Judged) -> ShortestTime | None:
@@ -308,7 +307,7 @@ def _find_broken_requirements(
 
     Args:
         candidates: scenario of each set of gains, by name.
-        held_out: their held-out trials, with the tuned gains as "tuned".
+        held_out: held-out trials of each set of gains, by the same names; "tuned" are the tuned gains.
         seed: seed of these trials.
     """
 
