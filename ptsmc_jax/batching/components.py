@@ -36,9 +36,9 @@ class BatchedArray:
     """An array for each element of a batch, as components, as one array with the batch axes first, or both.
 
     Args:
-        shape: of the array of one element.
+        shape: shape of the array of one element.
         parts: the components, in row-major order: arrays that broadcast to the batch's shape.
-        array: (*batch, *shape).
+        array: the array of all elements, (*batch, *shape).
         axes: the batch axes: 0, TRIAL, DIRECTION or TRIAL | DIRECTION. The batch's shape is (), (trials,),
             (directions, 1) or (directions, trials).
     """
@@ -121,7 +121,7 @@ def has_rule(name: str) -> bool:
 
 
 class ComponentRules:
-    """Evaluation of primitives on components.
+    """Rules that evaluate a primitive of a jaxpr on arrays that are split into components.
 
     Args:
         limit: entries of the largest array that is evaluated by components.
@@ -130,8 +130,8 @@ class ComponentRules:
 
     def __init__(self, limit: int = MAX_COMPONENTS, replacements: dict[str, Callable] | None = None):
         self.limit, self.replacements = limit, replacements or {}
-        # (component, broadcast component) by shape and identity of the component. Storing the component itself prevents
-        # that another object gets the same identity.
+        # (component, broadcast component) by shape and `_identity` of the component; the component is stored, because
+        # Python may reuse the identity of an object that is deleted
         self._broadcasts: dict[Any, tuple[Any, Any]] = {}
 
     def apply(self, eqn: Any, values: Sequence[BatchedArray]) -> list[np.ndarray] | None:
@@ -142,14 +142,17 @@ class ComponentRules:
         return rule(self, eqn, values)
 
     def broadcast(self, parts: Sequence) -> Sequence:
-        """Return components broadcast to a common batch shape. To broadcast each only once shortens traces by 1/8."""
+        """Return components broadcast to a common batch shape, each of them only once, which shortens traces by 1/8."""
         shapes = [np.shape(part) for part in parts]
         if len(set(shapes)) == 1:
             return parts
         shape = np.broadcast_shapes(*shapes)
-        return [part if old == shape else self._broadcast(part, shape) for part, old in zip(parts, shapes, strict=True)]
+        return [
+            part if old == shape else self._broadcast_once(part, shape) for part, old in zip(parts, shapes, strict=True)
+        ]
 
-    def _broadcast(self, part: Any, shape: tuple[int, ...]) -> Any:
+    def _broadcast_once(self, part: Any, shape: tuple[int, ...]) -> Any:
+        """Return a component broadcast to a batch shape, from the stored results if it was broadcast before."""
         key = shape, _identity(part)
         if key not in self._broadcasts:
             trailing = range(len(shape) - np.ndim(part), len(shape))
@@ -173,9 +176,11 @@ class ComponentRules:
         return self._elementwise(eqn, values) if same_size else None
 
     def _structural(self, eqn: Any, values: Sequence[BatchedArray]) -> list[np.ndarray]:
+        """Evaluate a primitive that only moves entries, such as a transpose."""
         return pick_entries(eqn, [value.components for value in values])
 
     def _fold(self, name: str, *items: Any) -> Any:
+        """Return the sum, product or extreme of components, by the function of `jax.lax` with this name."""
         if name in self.replacements:
             return reduce(self.replacements[name], items)
         return reduce(lambda a, b: getattr(lax, name)(*self.broadcast([a, b])), items)
@@ -198,17 +203,17 @@ class ComponentRules:
                 return parts
             return object_array(parts.shape, (lax.convert_element_type(part, dtype) for part in parts.flat))
 
-        def inner(row: np.ndarray, column: np.ndarray) -> Any:
+        def scalar_product(row: np.ndarray, column: np.ndarray) -> Any:
             pairs = [p for p in zip(row, column, strict=True) if not (skip_zeros and any(map(_is_zero, p)))]
             products = [lax.mul(*self.broadcast(pair)) for pair in pairs]
             return self._fold("add", *products) if products else dtype.type(0)
 
         left, right = map(convert, values, eqn.invars)
-        return [contract_entries(eqn, left, right, inner)]
+        return [contract_entries(eqn, left, right, scalar_product)]
 
 
 def _identity(part: Any) -> Any:
-    """Return a key that tells components apart: the value of a constant, the identity of any other."""
+    """Return a key that differs between components: the value of a constant, the identity of another object."""
     constant = isinstance(part, np.generic | np.ndarray) and not np.ndim(part)
     return (part.dtype, part.tobytes()) if constant else id(part)
 
@@ -280,7 +285,7 @@ def reduce_entries(eqn: Any, array: np.ndarray, fold: Callable[[np.ndarray], Any
     Args:
         eqn: the equation.
         array: its operand.
-        fold: entries (n,) -> their sum, product or extreme.
+        fold: function from entries (n,) to their sum, product or extreme.
     """
     axes = eqn.params["axes"]
     kept = [a for a in range(array.ndim) if a not in axes]
@@ -296,7 +301,7 @@ def contract_entries(eqn: Any, left: np.ndarray, right: np.ndarray, inner: Calla
         eqn: the equation.
         left: its first operand.
         right: its second operand.
-        inner: (row (n,), column (n,)) -> their scalar product.
+        inner: function from a row (n,) and a column (n,) to their scalar product.
     """
 
     def group_axes(array: np.ndarray, axes: Sequence[int], batch: Sequence[int]) -> np.ndarray:

@@ -26,7 +26,7 @@ from ptsmc_jax.batching.dependence import split_scan_operands
 
 BLOCK = 128  # trials in a block, a power of two
 UNROLL_LIMIT = 8  # length of the longest loop that is unrolled
-STACK_LIMIT = 256  # length of the longest loop without carries that is unrolled; its results are stacked
+STACK_LIMIT = 256  # length of the longest loop without carries that is unrolled, to stack its results
 MAX_COMPONENTS = 1024  # entries of the largest array; all arrays are split into components
 
 _CUSTOM_CALLS = ("custom_jvp_call", "custom_vjp_call")  # inlined: derivatives are taken before the kernel is built
@@ -79,10 +79,11 @@ def scan(
         number_refs, row_refs, end_refs = ({kind: next(remaining) for kind in t.parts} for t in (numbers, rows, ends))
         vectors = {kind: _load_rows(ref, rows.sizes[kind]) for kind, ref in row_refs.items()}
 
-        def operand(value: BatchedArray, stored: _StoredArray) -> Any:
+        def load_if_varying(value: BatchedArray, stored: _StoredArray) -> Any:
+            """Return an operand of the body: loaded if it differs by trial, otherwise its place in the tables."""
             return stored.in_tables(vectors).load() if value.axes & TRIAL else stored.in_tables(number_refs)
 
-        operands = list(map(operand, values, operand_slots))
+        operands = list(map(load_if_varying, values, operand_slots))
         last = _Interpreter(interpreted).loop(body, length, split_scan_operands(params, operands), varies)
         written: dict[str, list] = {}
         for value, stored in zip(last, end_slots, strict=True):
@@ -138,8 +139,8 @@ class _StoredArray(NamedTuple):
         kind: dtype of the table.
         start: index of the first entry.
         stride: distance from direction to direction, 0 if there is only one array.
-        shape: of the array.
-        dtype: of the array.
+        shape: shape of the array.
+        dtype: dtype of the array.
         table: the table, in the kernel.
     """
 
@@ -177,7 +178,7 @@ class _Tables:
         self.sizes: dict[str, int] = {}
 
     def add(self, parts: Sequence, size: int, shape: tuple[int, ...], dtype: Any, stride: int = 0) -> _StoredArray:
-        """Append the entries of an array, `size` of them. A table without entries is not created."""
+        """Append the `size` entries of an array and return its place. A table without entries is not created."""
         kind = _table_dtype(dtype)
         start = self.sizes.get(kind, 0)
         if size:
@@ -186,13 +187,13 @@ class _Tables:
         return _StoredArray(kind, start, stride, shape, dtype)
 
     def add_rows(self, value: BatchedArray, dtype: Any) -> _StoredArray:
-        """Append a row for each component of a value that differs by trial."""
+        """Append a row over the trials for each component of a value that differs by trial; return its place."""
         _check_size(value.shape)
         parts = value.components
         return self.add(list(parts.flat), parts.size, value.shape, dtype)
 
     def add_numbers(self, value: BatchedArray, dtype: Any, directions: int) -> _StoredArray:
-        """Append the entries of a value that is equal in all trials, for each direction if it differs by direction."""
+        """Append a value that is equal in all trials, once for each direction if these differ; return its place."""
         array = jnp.ravel(value.to_array((directions, 1) if value.axes else ())).astype(_table_dtype(dtype))
         return self.add([array], array.size, value.shape, dtype, math.prod(value.shape) if value.axes else 0)
 
@@ -243,7 +244,8 @@ def _select(k: Any, *values: Any) -> Any:
     return reduce(lambda value, i: jnp.where(k == np.int32(i), values[i], value), range(1, len(values)), values[0])
 
 
-# The maximum of NaN and a number is the number in Triton, so that a torque limit would hide a diverged trial.
+# The functions below return NaN if an operand is NaN. Triton's maximum returns the other operand, so that a torque
+# limit would hide a diverged trial.
 
 
 def _maximum(a: Any, b: Any) -> Any:
@@ -266,7 +268,7 @@ class _Interpreter:
     """Evaluates jaxprs inside the kernel. A component is a constant, a scalar or a vector over the block.
 
     Args:
-        interpreted: see `scan`.
+        interpreted: whether JAX interprets the kernel, for tests.
     """
 
     def __init__(self, interpreted: bool):
@@ -300,7 +302,7 @@ class _Interpreter:
             ]
             with jax.ensure_compile_time_eval():
                 return [_to_constant(out) for out in components.bind(eqn, arrays)]
-        # new rules for each equation: an array that was broadcast inside a branch or loop must not leave it
+        # each equation gets new rules, because they store broadcast arrays, which must not leave a branch or loop
         has_two_cases = name == "select_n" and len(values) == 3
         rules = components.ComponentRules(MAX_COMPONENTS, {} if has_two_cases else _REPLACEMENTS)
         results = rules.apply(eqn, values)
@@ -366,7 +368,7 @@ def _to_constant(value: Any) -> BatchedArray:
 
 
 def _is_constant(value: BatchedArray) -> bool:
-    """Return whether all components are constants: Pallas lowers no primitive of constants only."""
+    """Return whether all components are constants. Pallas cannot lower a primitive whose operands are all constants."""
     return all(isinstance(part, np.ndarray | np.generic) for part in value.components.flat)
 
 

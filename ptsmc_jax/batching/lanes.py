@@ -59,7 +59,7 @@ def vmap(function: Callable, in_axes: Any = 0, *, strict: bool = False, kernel: 
     [[0.0, -1.0, 0.0], [2.0, 0.0, 0.0]]
     """
 
-    def mapped(*args: Any) -> Any:
+    def batched_function(*args: Any) -> Any:
         trials, one_trial, values = _batched_arguments(args, in_axes)
         closed, out = jax.make_jaxpr(function, return_shape=True)(*one_trial)
         results = _Interpreter(trials, strict, use_kernel=kernel).evaluate(
@@ -67,7 +67,7 @@ def vmap(function: Callable, in_axes: Any = 0, *, strict: bool = False, kernel: 
         )
         return jax.tree.unflatten(jax.tree.structure(out), [value.to_array((trials,)) for value in results])
 
-    return mapped
+    return batched_function
 
 
 def jvp(function: Callable, in_axes: Any = 0, *, kernel: bool = False) -> Callable:
@@ -77,8 +77,8 @@ def jvp(function: Callable, in_axes: Any = 0, *, kernel: bool = False) -> Callab
 
     Args:
         function: a function of arrays in pytrees.
-        in_axes: see `vmap`.
-        kernel: see `vmap`.
+        in_axes: mapped axes of the arguments, as in `vmap`.
+        kernel: run long loops as one kernel, as in `vmap`.
 
     Returns:
         (arguments, directions) -> (values, tangents). Both parameters are tuples. A direction is a pytree like its
@@ -90,7 +90,8 @@ def jvp(function: Callable, in_axes: Any = 0, *, kernel: bool = False) -> Callab
     ([9.0, 16.0], [[6.0, 8.0]])
     """
 
-    def mapped(args: tuple, directions: tuple) -> tuple[Any, Any]:
+    def values_and_tangents(args: tuple, directions: tuple) -> tuple[Any, Any]:
+        """Return the values of the function for all trials, and its derivatives along all directions."""
         trials, one_trial, values = _batched_arguments(args, in_axes)
         active = [k for k, along in enumerate(directions) if along is not None]
         if not active or len(directions) > len(args):
@@ -114,7 +115,7 @@ def jvp(function: Callable, in_axes: Any = 0, *, kernel: bool = False) -> Callab
         batches = [(trials,)] * half + [(count, trials)] * half
         return jax.tree.unflatten(jax.tree.structure(out), list(map(BatchedArray.to_array, results, batches)))
 
-    return mapped
+    return values_and_tangents
 
 
 def _batched_arguments(args: tuple, in_axes: Any) -> tuple[int, tuple, list[BatchedArray]]:
@@ -154,7 +155,7 @@ class _Interpreter:
 
     Args:
         trials: size of the batch.
-        strict: see `vmap`.
+        strict: refuse primitives without a rule, as in `vmap`.
         directions: number of directions of tangents, 0 without tangents.
         use_kernel: run long scans as a kernel.
     """
@@ -165,7 +166,7 @@ class _Interpreter:
         self.rules = components.ComponentRules()
 
     def evaluate(self, closed: Any, arguments: Sequence[BatchedArray]) -> list[BatchedArray]:
-        """Return the outputs of a jaxpr."""
+        """Return the outputs of a jaxpr for batched arguments."""
         jaxpr, consts = dependence.open_jaxpr(closed)
         arguments = _unbatch_empty(arguments, jaxpr.invars)
         return dependence.interpret(jaxpr, consts, arguments, BatchedArray.unbatched, self.apply)
@@ -285,7 +286,7 @@ class _Interpreter:
         return BatchedArray(shape, array=jnp.moveaxis(array, 0, len(batch)).reshape((*batch, *shape)), axes=axes)
 
     def scan_in_kernel(self, params: Any, values: list[BatchedArray], axes: Sequence[int]) -> list | None:
-        """Return the last carries of a scan by `kernel.scan`, or None if it stays a scan."""
+        """Return the last carries of a scan that runs as a kernel, or None if it must remain a `lax.scan`."""
         from ptsmc_jax.batching import kernel  # imported on demand: Pallas takes a while
 
         batch = self.batch_shapes[TRIAL | DIRECTION if self.directions else TRIAL]
@@ -295,17 +296,17 @@ class _Interpreter:
             warnings.warn(f"a loop runs step by step, which may be slow: {error}", LanesWarning, stacklevel=2)
             return None
 
-        def to_carry(parts: np.ndarray, axes: int) -> BatchedArray:
-            """Return a carry with its batch axes: the kernel computes each for each direction and trial."""
+        def drop_equal_axes(parts: np.ndarray, axes: int) -> BatchedArray:
+            """Return a carry with the batch axes `axes` over which it differs. The kernel returns it with all axes."""
 
-            def select_axes(part: Array) -> Array:
+            def drop_from_component(part: Array) -> Array:
                 part = part if axes & DIRECTION or part.ndim == 1 else part[0]
                 return part if axes & TRIAL else part[..., :1] if axes else part[0]
 
             axes = axes if parts.size else TRIAL
-            return self._align_one(jax.tree.map(select_axes, BatchedArray.of_components(parts, axes)), axes)
+            return self._align_one(jax.tree.map(drop_from_component, BatchedArray.of_components(parts, axes)), axes)
 
-        return last and list(map(to_carry, last, axes))
+        return last and list(map(drop_equal_axes, last, axes))
 
     def while_loop(self, eqn: Any, values: list[BatchedArray]) -> list[BatchedArray]:
         """Return the results of `lax.while_loop`. A trial whose test is false keeps its carries."""

@@ -20,16 +20,17 @@ CAN_DEADLOCK = jaxlib.version.__version_info__ < (0, 11)
 # jaxlib 0.10.2 splits a call among threads from about 2e5 operations (matrices times order^3) on
 MAX_BATCHED_OPERATIONS = 1 << 16
 SIZE_LIMITED = frozenset(("lu", "cholesky", "triangular_solve"))  # primitives that may be batched up to this limit
+# primitives that are never batched: jaxlib shares even two matrices among threads, as in eigh, or the limit is unknown
 NEVER_BATCHED = frozenset(
     """cholesky_update eig eigh geqp3 geqrf hessenberg householder_product ormqr qr schur svd tridiagonal
     tridiagonal_solve""".split()
-)  # primitives that are never batched: jaxlib shares two matrices already, as in eigh, or the limit is not known
+)
 
 
 def vmap(function: Callable) -> Callable:
     """Return `jax.vmap(function)` over the first axis of all arguments, safe for functions that call LAPACK."""
 
-    def mapped(*args: Any) -> Any:
+    def batched_function(*args: Any) -> Any:
         leaves = jax.tree.leaves(args)
         element = jax.tree.map(lambda v: jax.ShapeDtypeStruct(v.shape[1:], v.dtype), args)
         closed, out = jax.make_jaxpr(function, return_shape=True)(*element)
@@ -37,7 +38,7 @@ def vmap(function: Callable) -> Callable:
         results = transform(core.jaxpr_as_fun(closed), [0] * len(leaves))(*leaves)
         return jax.tree.unflatten(jax.tree.structure(out), results)
 
-    return mapped
+    return batched_function
 
 
 def choose_vmap(equations: Sequence, size: int) -> Callable:
@@ -50,14 +51,14 @@ def choose_vmap(equations: Sequence, size: int) -> Callable:
 def sequential_map(function: Callable, in_axes: Sequence[int | None]) -> Callable:
     """Return `jax.vmap(function, in_axes)` as a loop over the elements of the batch. Axes are 0 or None."""
 
-    def mapped(*args: Any) -> Any:
+    def batched_function(*args: Any) -> Any:
         def evaluate_element(mapped_values: list) -> Any:
             remaining = iter(mapped_values)
             return function(*(v if axis is None else next(remaining) for v, axis in zip(args, in_axes, strict=True)))
 
         return lax.map(evaluate_element, [v for v, axis in zip(args, in_axes, strict=True) if axis is not None])
 
-    return mapped
+    return batched_function
 
 
 def _operations(equations: Sequence) -> float:

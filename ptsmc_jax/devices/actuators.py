@@ -61,12 +61,12 @@ class AppliedTorque(NamedTuple):
 class Actuators:
     """Torque limit per axis, delay, then per channel: quantisation, limits, rate limit and first-order lag."""
 
-    torque_limit: Leaf | None = None  # per body axis [N m]
-    rate_limit: Leaf | None = None  # [N m/s]
-    lag: Leaf | None = None  # time constant [s]
-    step: Leaf | None = None  # quantisation [N m]
+    torque_limit: Leaf | None = None  # limit per body axis [N m]
+    rate_limit: Leaf | None = None  # limit on the rate of change of each channel's torque [N m/s]
+    lag: Leaf | None = None  # time constant of each channel [s]
+    step: Leaf | None = None  # quantisation step of the torque [N m]
     wheels: Wheels | None = None
-    delay: int = field(default=0, metadata={"static": True})  # whole control periods
+    delay: int = field(default=0, metadata={"static": True})  # delay of the command in whole control periods
     # hardware errors: differences between the true actuators and those that the flight software knows
     scale: Leaf | None = None  # (channels,) ratio of true to nominal torque [-]
     directions: Leaf | None = None  # (m, channels) true unit vectors of the channels in body axes
@@ -212,16 +212,15 @@ class Actuators:
             if self.lag is not None and state.v is not None:
                 lag_span = self.lag * -jnp.expm1(-dt / self.lag)
                 h = h - lag_span * state.v
-            inverse_span = 1.0 / jnp.where(
-                dt > lag_span, dt - lag_span, 1.0
-            )  # multiplied below, because a division is slower
+            # two multiplications by the inverse are faster than two divisions
+            inverse_span = 1.0 / jnp.where(dt > lag_span, dt - lag_span, 1.0)
             v = jnp.clip(v, inverse_span * (h - device.momentum_limit), inverse_span * (h + device.momentum_limit))
         if device.torque_limit is not None:
             v = jnp.clip(v, -device.torque_limit, device.torque_limit)
         return v
 
     def channel_torques(self, drive: Drive, s: Scalar) -> tuple[Array, Array, Array]:
-        """Return the nominal torque of each channel s [s] into the period, its integral, and the integral of that.
+        """Return the nominal torque of each channel s [s] into the period, its integral, and its double integral.
 
         The units are [N m, N m s, N m s^2]. The torque obeys v' = (c - v) / lag with |v'| at most the rate limit. It is
         a ramp until |c - v| equals rate limit times lag, and then an exponential.
@@ -255,7 +254,7 @@ class Actuators:
         )
 
     def torque_and_momentum(self, drive: Drive, s: Scalar) -> tuple[Array, Array | None]:
-        """Return the true torque of each channel [N m] s [s] into the period, and the wheels' momentum [N m s]."""
+        """Return true torques of the channels [N m] and the wheels' momentum [N m s] at s [s] into the period."""
         v, impulse, _ = self.channel_torques(drive, s)
         momentum = None if drive.h is None else drive.h - self.true_torque(drive, impulse)
         return self.true_torque(drive, v), momentum

@@ -18,8 +18,8 @@ from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 class Estimate(NamedTuple):
     """State of the attitude filter."""
 
-    q: Array  # (4,)
-    bias: Array  # (3,) of the gyro [rad/s]
+    q: Array  # (4,) estimated attitude, a unit quaternion
+    bias: Array  # (3,) estimated bias of the gyro [rad/s]
 
 
 @pytree

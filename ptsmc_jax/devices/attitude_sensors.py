@@ -16,7 +16,7 @@ from ptsmc_jax.devices.star_times import pattern
 from ptsmc_jax.numerics import attitude, guards
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 
-INTEGER_TOLERANCE = 1e-9  # relative
+INTEGER_TOLERANCE = 1e-9  # relative tolerance for a whole number of control periods
 
 
 @pytree
@@ -34,8 +34,9 @@ class SampleTimes:
     period: Leaf  # control period [s]
     every: int | None = field(metadata={"static": True})  # control periods between readings; None if not a whole number
     wait: int = field(metadata={"static": True})  # smallest number of control samples between a reading and its use
-    split: bool = field(metadata={"static": True})  # whether this number is `wait` + 1 for some readings
-    pattern: tuple[int, int] = field(metadata={"static": True})  # see `star_times.pattern`
+    split: bool = field(metadata={"static": True})  # whether some readings wait for `wait` + 1 control samples
+    # numbers of control periods and of readings after which the times repeat, see `star_times.pattern`
+    pattern: tuple[int, int] = field(metadata={"static": True})
 
     @property
     def longest_wait(self) -> int:
@@ -98,13 +99,13 @@ class SampleTimes:
         return jnp.asarray(sample, float) * self.period
 
     def _newest_reading(self, sample: Any, latency: Any = 0.0) -> Any:
-        """Return the number of the newest reading that is at least a latency [s] old at a control sample."""
+        """Return the number of the newest reading that is at least a latency [s] old at the control sample `sample`."""
         t = self._time(sample)
         return jnp.floor((t - latency + guards.time_tolerance(self.period, t)) / self.interval)
 
 
 def sample_times(interval: float, latency: float, period: float) -> SampleTimes:
-    """Return the sample times of a sensor.
+    """Return when a sensor takes readings and when the flight software receives them.
 
     Args:
         interval: time between readings, at least a control period [s].

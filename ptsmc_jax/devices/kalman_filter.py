@@ -45,8 +45,8 @@ TURN, BIAS, NOISE = slice(0, 3), slice(3, 6), slice(6, 9)
 class Track(NamedTuple):
     """The state of the filter."""
 
-    q: Array  # (4,) attitude
-    bias: Array  # (3,) gyro bias [rad/s]
+    q: Array  # (4,) estimated attitude, a unit quaternion
+    bias: Array  # (3,) estimated gyro bias [rad/s]
     rate: Array  # (3,) last gyro sample, less its estimated noise [rad/s]
     past_q: Any  # (past, 4) attitudes at the last control samples, newest first; None if no sensor needs them
     past_w: Any  # (past, 3) body rates at these samples [rad/s]; None if all sensors read at control samples
@@ -221,6 +221,7 @@ class KalmanFilter:
             return jnp.where(periods == sensor.times.wait, values[index], values[index + 1])
 
         def rows_at_reading(values: Array) -> Array:
+            """Return the rows (3, ..) of the attitude error at the time of the reading, from rows of all errors."""
             blocks = jnp.concatenate([values[TURN], values[9:]]).reshape(self.past_samples + 1, 3, *values.shape[1:])
             rows = entry_back(blocks)
             return rows if sensor.times.every is not None else rows + fraction * (entry_back(blocks, 1) - rows)
@@ -250,7 +251,7 @@ class KalmanFilter:
         return replace(self, sensors=tuple(sensor.at_control_samples() for sensor in self.sensors))
 
     def local_coordinates(self, track: Track, other: Track) -> Float[Array, " n"]:
-        """Return local coordinates (9 + 3 past,) [rad, rad/s] of a state near another one, to first order."""
+        """Return local coordinates (9 + 3 past,) [rad, rad/s] of `other` relative to `track`, to first order."""
         turn = attitude.small_rotation
         past = [] if track.past_q is None else [jax.vmap(turn)(track.past_q, other.past_q).reshape(-1)]
         return jnp.concatenate([turn(track.q, other.q), other.bias - track.bias, track.rate - other.rate, *past])
@@ -334,7 +335,7 @@ def _steady_state(kalman: KalmanFilter) -> np.ndarray:
     return factors
 
 
-@programs.jit  # one compiled program for all filters with sensors of the same kinds and sample times
+@programs.jit  # filters with sensors of the same kinds and sample times share one compiled program
 def _noise_of_period(kalman: KalmanFilter) -> Array:
     """Return the covariance (errors, errors) that a control period at rest adds."""
     size = 9 + 3 * kalman.past_samples

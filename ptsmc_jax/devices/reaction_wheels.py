@@ -23,8 +23,8 @@ class Wheels:
     axes: Leaf  # (3, n) A: spin axes in body axes, unit columns
     allocation: Leaf  # (n, 3) pseudo-inverse of A
     initial: Leaf  # (n,) momentum at t = 0 [N m s]
-    torque_limit: Leaf | None = None  # per wheel [N m]
-    momentum_limit: Leaf | None = None  # per wheel [N m s]
+    torque_limit: Leaf | None = None  # limit of each wheel's torque [N m]
+    momentum_limit: Leaf | None = None  # limit of each wheel's momentum [N m s]
 
 
 def wheels(axes: Any, initial: Any = None, torque_limit: Any = None, momentum_limit: Any = None) -> Wheels:

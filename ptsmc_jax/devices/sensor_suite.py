@@ -24,7 +24,7 @@ from ptsmc_jax.plants.rigid_body import AttitudeState
 class Delivery(NamedTuple):
     """Reading of one sensor for the flight software at a control sample."""
 
-    reading: Array  # (size,)
+    reading: Array  # (size,) reading of the sensor, see `AttitudeSensor.read`
     weight: Scalar  # 1, or 0 for no reading; in a partial first period between them, see `KalmanFilter.correct`
 
 
@@ -42,8 +42,9 @@ class SuiteMemory(NamedTuple):
     keys: Any  # random keys: noise of each attitude sensor, gyro noise, gyro drift; None for no noise
     noise: tuple[Array, ...]  # noise of the next sample: each attitude sensor (m,), then the gyro (3,) [rad/s]
     bias: Array  # (3,) gyro bias [rad/s]
-    waiting: tuple[Any, ...]  # for each attitude sensor: `Delivery` (queue, ..) of the last samples, newest first
-    estimate: Track
+    # readings that each attitude sensor delivers later, as `Delivery` (queue, ..), newest first; None without latency
+    waiting: tuple[Any, ...]
+    estimate: Track  # state of the Kalman filter
 
 
 @pytree
@@ -59,9 +60,7 @@ class SensorSuite(SpacecraftSensors):
     given_bias: Leaf | None = None  # (3,) gyro bias at the first sample, if it is not random [rad/s]
     rate_scale: Leaf | None = None  # (3,) ratio of gyro reading to true rate [-]
     outage: Leaf | None = None  # (2,) start and end of an outage of the first attitude sensor [s]
-    noise_free: bool = field(
-        default=False, metadata={"static": True}
-    )  # whether no noise is generated, see `without_noise`
+    noise_free: bool = field(default=False, metadata={"static": True})  # whether no noise is generated
 
     @property
     def star_tracker(self) -> StarTracker | None:
@@ -135,7 +134,7 @@ class SensorSuite(SpacecraftSensors):
         return named, memory
 
     def filter_state(self, memory: SuiteMemory) -> dict[str, Array]:
-        """Return the state of the filter as exported C has it, by name."""
+        """Return the state of the Kalman filter by the names of the fields in exported C."""
         track = memory.estimate
         named = {"attitude": track.q, "bias": track.bias, "gyro": track.rate, "covariance": track.covariance}
         past = {"past_attitude": track.past_q, "past_rate": track.past_w}
@@ -152,7 +151,7 @@ class SensorSuite(SpacecraftSensors):
         return AttitudeState(estimate.q, estimate.w), memory_next._replace(estimate=estimate)
 
     def without_noise(self) -> "SensorSuite":
-        """Return the suite without noise and bias; the filter keeps its covariance."""
+        """Return the suite without noise and gyro bias. The filter still assumes them, so its gains are unchanged."""
         return replace(self, noise_free=True, given_bias=None)
 
     def at_control_samples(self) -> "SensorSuite":
@@ -165,7 +164,7 @@ class SensorSuite(SpacecraftSensors):
 
         Args:
             sample: number of the first control sample.
-            fraction: its weight, see `KalmanFilter.begin`.
+            fraction: weight of this sample, below 1 in a partial first period.
         """
         identity = jnp.array([0.0, 0.0, 0.0, 1.0])
         axes = [np.pad(sensor.sensitivity(identity), ((0, 0), (0, 6))) for sensor in self.sensors]
@@ -191,7 +190,7 @@ class SensorSuite(SpacecraftSensors):
         return jnp.concatenate([*changes, (near.w - x.w) * (1.0 if self.rate_scale is None else self.rate_scale)])
 
     def sample_delays(self, now: Ticks) -> np.ndarray:
-        """Return how many control samples ago each reading was taken, (N, m).
+        """Return the age of each component of the readings in control samples, (N, m), at N control samples.
 
         A reading between two control samples counts from the later one.
         """

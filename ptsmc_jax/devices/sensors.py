@@ -28,9 +28,8 @@ from ptsmc_jax.plants.rigid_body import AttitudeState
 
 ATTITUDE_NOISE, RATE_NOISE, STATE_NOISE = "attitude_noise", "rate_noise", "state_noise"
 RATE_BIAS, BIAS_WALK, FILTER_START = "rate_bias", "rate_bias_walk", "filter_start"
-ATTITUDE_AND_BIAS = np.eye(9)[
-    np.r_[0:3, 6:9]
-]  # rows of `MeasurementModel.start` for a filter's errors of attitude and bias
+# rows of `MeasurementModel.start` for a filter's errors of attitude and bias
+ATTITUDE_AND_BIAS = np.eye(9)[np.r_[0:3, 6:9]]
 
 
 class Sensor(ABC):
@@ -39,7 +38,7 @@ class Sensor(ABC):
     A true state x is the part of the plant state that sensors can see, `Plant.visible`.
     """
 
-    perfect: ClassVar[bool] = False  # whether the law sees the true state
+    perfect: ClassVar[bool] = False  # whether the law gets the true state instead of a measured one
 
     @abstractmethod
     def begin(self, seed: WholeNumber, trial: WholeNumber, x0: Any, now: Ticks) -> Any:
@@ -60,7 +59,7 @@ class Sensor(ABC):
             memory: from `begin`, or from the last sample.
             x: true state.
             now: the control period that the sample begins.
-            dt: length of the period just ended [s].
+            dt: length of the period that ends at the sample [s].
             star_x: true state at the time of `newest_reading_age`, for sensors with their own clock; None without them.
         """
 
@@ -146,7 +145,7 @@ class MeasurementModel(NamedTuple):
 class Memory(NamedTuple):
     """Memory of `Sensors` between samples."""
 
-    keys: tuple[draws.Key, ...] | None  # see `Sensors.keys`; None without noise
+    keys: tuple[draws.Key, ...] | None  # random keys of each noise and of the bias drift; None without noise
     noise: tuple[Array, ...]  # noise of the next sample
     bias: Any  # (3,) gyro bias [rad/s]; None without bias
     estimate: Any  # `Estimate`; None without a filter
@@ -175,7 +174,7 @@ class SpacecraftSensors(Sensor):
         return tuple(draws.streams(seed, trial, [*(name for name, _, _ in self.noises), BIAS_WALK]))
 
     def noise(self, keys: tuple[draws.Key, ...] | None, sample: Int[Array, ""]) -> tuple[Array, ...]:
-        """Return each of `noises` at one sample, in its unit; that of the gyro is (3,) [rad/s]."""
+        """Return the noise of each of `noises` at one sample, in its unit; the gyro noise is (3,) [rad/s]."""
         if keys is None:
             return tuple(jnp.zeros(size) for _, _, size in self.noises)
         each = zip(self.noises, keys, strict=False)
@@ -210,7 +209,7 @@ class SpacecraftSensors(Sensor):
             w: true body rate (3,) [rad/s].
             noise: noise of the sample (3,) [rad/s].
             now: the control period that the sample begins.
-            dt: length of the period just ended [s].
+            dt: length of the period that ends at the sample [s].
         """
         bias = memory.bias
         if self.bias_rate is not None and memory.keys is not None:
@@ -251,12 +250,10 @@ class Sensors(SpacecraftSensors):
     rate_scale: Leaf | None = None  # (3,) ratio of gyro reading to true rate [-]
     outage: Leaf | None = None  # (2,) start and end of an outage of the star tracker [s]; with a filter
     own_times: SampleTimes | None = None  # sample times of a star tracker with its own clock, with a filter
-    noise_free: bool = field(
-        default=False, metadata={"static": True}
-    )  # whether no noise is generated, see `without_noise`
+    noise_free: bool = field(default=False, metadata={"static": True})  # whether no noise is generated
 
     def star_attitude(self, q: Float[Array, "4"]) -> Float[Array, "4"]:
-        """Return the attitude (4,) of the star tracker for an attitude of the body, both unit quaternions."""
+        """Return the true attitude (4,) of the misaligned star tracker for a body attitude, both unit quaternions."""
         if self.misalignment is None:
             return q
         return attitude.multiply(q, attitude.from_rotation_vector(self.misalignment))
@@ -345,7 +342,7 @@ class Sensors(SpacecraftSensors):
         if self.own_times is None:
             estimate = self.filter.correct(self.filter.propagate(old, rate, read.w, dt), read.q, weight)
         else:
-            # without a measurement the age is the length of the period, as in exported C
+            # if no star tracker sample is due, its age is set to the length of the period, as in exported C
             age = jnp.where(weight > 0.0, self.own_times.newest_reading_age(now.sample, dt), dt)
             estimate = self.filter.correct_between(old, rate, read.w, dt, read.q, age, weight)
         return AttitudeState(estimate.q, read.w - estimate.bias), memory_next._replace(estimate=estimate, rate=read.w)
@@ -369,7 +366,7 @@ class Sensors(SpacecraftSensors):
         return memory._replace(estimate=Estimate(q, memory.estimate.bias + bias), rate=memory.rate + rate)
 
     def local_coordinates(self, memory: Memory, other: Memory) -> Float[Array, " n"]:
-        """Return local coordinates (n,) [rad, rad/s] of another memory relative to a memory, to first order."""
+        """Return local coordinates (n,) [rad, rad/s] of another memory, to first order: the inverse of `retract`."""
         if memory.estimate is None or other.estimate is None:
             return jnp.zeros(0)
         turn = attitude.small_rotation(memory.estimate.q, other.estimate.q)
@@ -380,7 +377,7 @@ class Sensors(SpacecraftSensors):
 
         Args:
             sample: number of the first control sample.
-            fraction: its weight, see `AttitudeFilter.begin`.
+            fraction: length of a partial first period as a fraction of a full one, else 1.
         """
         star, gyro = (float(v) for v in (self.attitude_noise, self.rate_noise))
         bias, drift = (0.0 if v is None else float(v) for v in (self.rate_bias, self.bias_rate))

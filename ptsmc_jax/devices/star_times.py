@@ -48,12 +48,14 @@ def filter_between_samples(
         bias_walk: random walk of the gyro's bias [rad/s/sqrt(s)].
         period: control period [s].
         interval: time between star tracker samples [s].
-        repeating: the `pattern` of the sample times.
+        repeating: control periods and star tracker samples after which the times repeat, see `pattern`.
     """
     k1, k2 = filter_gains(bandwidth, interval)
     periods, samples = repeating
     count = np.arange(1, periods + 1)
-    ages = count - (count * samples // periods) * (periods / samples)  # in periods
+    ages = count - (count * samples // periods) * (
+        periods / samples
+    )  # since the newest star tracker sample, in control periods
     sigmas = jnp.stack([rate_noise, bias_walk * jnp.sqrt(period), attitude_noise])
 
     def errors_at_next_sample(

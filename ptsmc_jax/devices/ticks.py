@@ -12,7 +12,6 @@ class Ticks(NamedTuple):
     t_next: Array  # end [s]
     hold: Array  # bool: after the hand-over
     sample: Array  # int32: number of the sample, from the hand-over (anchored) or from t = 0 (others)
-    noise_weight: (
-        Array  # fraction of this sample's own noise, the rest is the next sample's; below 1 in a partial first period
-    )
+    # weight of this sample's own noise, below 1 in a partial first period; the rest is the weight of the next noise
+    noise_weight: Array
     partial: Array  # bool: the first period of an anchored clock, whose length depends on the hand-over time

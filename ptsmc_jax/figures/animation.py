@@ -48,8 +48,8 @@ def animate_run(parts: Parts, log: Log, frames: int = 40) -> Animation:
     """Animate the body of a run with its axes; the axes of the reference are dashed.
 
     Args:
-        parts: of the run.
-        log: numpy arrays (time, component).
+        parts: parts of the run.
+        log: history of the run, NumPy arrays (time, component).
         frames: number of frames, evenly spread over the run.
 
     Returns:

@@ -35,11 +35,11 @@ class Column(NamedTuple):
 
     unit: str  # empty: no unit
     values: np.ndarray  # (trials,), NaN if a trial has no value
-    limit: float | None = None  # required
-    of_time: str = ""  # required and observed fraction, if the requirement is on a fraction of the time
+    limit: float | None = None  # limit of the requirement on it; None: there is no requirement
+    of_time: str = ""  # text with the required and observed fractions, if the requirement is on a fraction of the time
 
     def label(self, name: str) -> str:
-        """Return the name with the unit."""
+        """Return the label of an axis: the name of the column with its unit."""
         return with_unit(name, self.unit)
 
     def in_readable_unit(self) -> "Column":
@@ -68,7 +68,7 @@ def fan(t: np.ndarray, errors: np.ndarray, worst: tuple[int, np.ndarray], t_f: f
         errors: (trials, time) norms of the error, in the unit of this kind of plant.
         worst: the trial of the largest window error, and its errors (time,).
         t_f: the prescribed time [s].
-        kind: of the plant; it determines the unit.
+        kind: kind of the plant, which determines the unit.
     """
     convert, name, unit = error_display(kind)
     errors, largest = convert(errors), convert(worst[1])

@@ -92,9 +92,9 @@ def innovations(t: np.ndarray, names: list[str], values: np.ndarray, sigma: np.n
 
     Args:
         t: times (rows,) [s].
-        names: of the components, with units.
+        names: names of the components, with units.
         values: innovations (rows, components), NaN without a reading.
-        sigma: their 1 sigma (rows, components).
+        sigma: 1 sigma of the innovations (rows, components).
     """
     figure, axes = _panels(names, "Innovations and their 3 sigma bands")
     selected = _select_rows(len(t))
@@ -103,7 +103,7 @@ def innovations(t: np.ndarray, names: list[str], values: np.ndarray, sigma: np.n
         drawn = selected[np.isfinite(band[selected])]
         panel.fill_between(t[drawn], -band[drawn], band[drawn], color="0.9")
         panel.plot(t[drawn], values[drawn, k], ".", ms=2, color=style.STYLES[0][0])
-        if drawn.size:  # the first bands may be wide, because little is known of the state at the start
+        if drawn.size:  # quantiles set the height: the first bands are wide, as the state is hardly known at the start
             half_height = 1.5 * max(np.nanquantile(band, 0.9), np.nanquantile(np.abs(values[:, k]), 0.99))
             panel.set_ylim(-half_height, half_height)
     return figure
@@ -114,7 +114,7 @@ def autocorrelation(names: list[str], values: np.ndarray, counts: np.ndarray) ->
     """Draw the autocorrelation of the whitened innovations with its 95 % band.
 
     Args:
-        names: of the components.
+        names: names of the components.
         values: (lags, components) [-].
         counts: number of readings of each component.
     """

@@ -9,11 +9,11 @@ from ptsmc_jax.figures.style import STYLES, plain_ticks, styled
 from ptsmc_jax.theory.margins import Margins
 
 CONTOUR = 6.0  # sensitivity of the contour [dB]
-LARGEST_SHOWN = 40.0  # largest and smallest |L| that is drawn [dB]
+LARGEST_SHOWN = 40.0  # |L| is drawn from minus this value to this value [dB]
 
 
 def _decibels(values: np.ndarray) -> np.ndarray:
-    """Return sizes [dB], far below the axis for 0, as of a saturated command."""
+    """Return sizes [dB]. A size of 0, as of a saturated command, becomes a number far below the axis."""
     return 20.0 * np.log10(np.maximum(np.abs(values), 1e-9))
 
 

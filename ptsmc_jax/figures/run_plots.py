@@ -15,9 +15,9 @@ from ptsmc_jax.theory import envelopes, solutions
 from ptsmc_jax.theory.lower_bound import LowerBound
 
 FAR_OFF = 3.0  # a limit or command beyond this multiple of the curves is only named in the legend
-SMALLEST, LARGEST = 1e-16, 1e100  # smallest error and s, and largest number, that are drawn
+SMALLEST, LARGEST = 1e-16, 1e100  # log axes end at SMALLEST; larger numbers than LARGEST are left out
 MANY_POINTS = 200_000  # with more points, the search of a place for the legend takes as long as drawing
-EXACT_LINE: Any = {"color": "0.25", "lw": 0.9, "ls": (0, (1, 1.5))}  # line of the exact motion
+EXACT_LINE: Any = {"color": "0.25", "lw": 0.9, "ls": (0, (1, 1.5))}  # style of the line of the exact motion
 BOUND_LINE: Any = {"color": "0.35", "lw": 1.0, "ls": "--", "label": "bound, no noise"}
 
 
@@ -63,9 +63,8 @@ def error(parts: Parts, log: Log, lower_bound: LowerBound | None = None) -> Figu
         axes.plot(before, convert(envelopes.error_bound(parts, before)), **BOUND_LINE)
     if lower_bound is not None and lower_bound.window_error > 0.0:
         lower_bound_values = convert(lower_bound.error)
-        known = (lower_bound_values > 0.0) & (
-            lower_bound_values < size.max()
-        )  # nothing is known before the first samples
+        # without the values before the first samples, when nothing is known of the state
+        known = (lower_bound_values > 0.0) & (lower_bound_values < size.max())
         axes.plot(lower_bound.t[known], lower_bound_values[known], color=STYLES[2][0], lw=1.2, label="lower bound")
     t_f = float(parts.controller.t_f)
     axes.axvspan(t_f, t_f + float(parts.window), color="0.85", label="window of window_error")
@@ -114,7 +113,7 @@ def wheel_torque(parts: Parts, log: Log) -> Figure:
 
 
 def _plot_wheels(parts: Parts, log: Log, index: int, title: str, quantity: str, unit: str) -> Figure:
-    """Plot a quantity of each wheel over time, `log.wheels[which]`, with its limit, a field of `Wheels`."""
+    """Plot a quantity of each wheel over time, `log.wheels[index]`, with its limit, a field of `Wheels`."""
     assert log.wheels is not None
     figure, axes = new_figure(title, f"{quantity} [{unit}]")
     _plot_components(axes, log.t, log.wheels[index], "hv"[index])

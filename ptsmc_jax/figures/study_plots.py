@@ -25,7 +25,7 @@ from ptsmc_jax.scenario.gain_bounds import is_log_scaled
 from ptsmc_jax.simulation.catalogues import CATALOGUES
 
 MARKERS = ("o", "^", "s", "D", "v")
-BEYOND = ("x", "+", "1", "2", "3", "4")  # of points that violate a limit, one for each limit
+BEYOND = ("x", "+", "1", "2", "3", "4")  # markers of points that violate a limit, one for each limit
 # marker of a pair with a failed trial, visible on any colour
 FAILED: Any = {"marker": "X", "color": "white", "mec": "black", "mew": 0.6, "ms": 6}
 WIDEST = 1e4  # largest ratio of the values that the colours of a map span
@@ -35,19 +35,19 @@ class Profile(NamedTuple):
     """The objective along one gain; the other gains are the tuned ones."""
 
     unit: str
-    gain: np.ndarray  # (points,)
+    gain: np.ndarray  # (points,) values of the gain
     goal: np.ndarray  # (points,) objective, NaN if there is none
-    over: np.ndarray  # (points,) largest metric / limit
-    nearest: Sequence[str]  # (points,) name of that metric
+    over: np.ndarray  # (points,) largest ratio of a metric to its limit
+    nearest: Sequence[str]  # (points,) name of the metric with the largest ratio
     tuned: float  # the tuned gain
 
 
 class MapAxis(NamedTuple):
     """One of the two keys of a map, with its values."""
 
-    label: str  # the key and its unit
+    label: str  # label of the axis: the key and its unit
     values: Sequence[float]
-    logarithmic: bool
+    logarithmic: bool  # whether the axis has a log scale
 
     @property
     def edges(self) -> np.ndarray:
@@ -62,9 +62,9 @@ class Sweep(NamedTuple):
     """The values at which the points of a front were searched."""
 
     title: str
-    label: str  # of the axis, with the unit
+    label: str  # label of the axis, with the unit
     values: Sequence[float]
-    ticks: Sequence[str] | None = None  # texts at the values; None: the numbers
+    ticks: Sequence[str] | None = None  # tick labels at `values`; None: the values as numbers
 
 
 def _colours_and_markers(count: int) -> list[tuple[str, str]]:
@@ -147,7 +147,7 @@ def profiles(gains: Mapping[str, Profile], goal: str) -> Figure:
     axes = figure.subplots(len(gains), 1, sharey=True, squeeze=False)[:, 0]
     for ax, (name, profile) in zip(axes, gains.items(), strict=True):
         points = np.stack([profile.gain, profile.gain], axis=1)
-        ax.update_datalim(points, updatey=False)  # also gains at which no trial has an objective
+        ax.update_datalim(points, updatey=False)  # the axis includes gains at which no trial has an objective
         ax.semilogy(profile.gain, profile.goal, color="0.6", lw=1.2, label="objective")
         within = profile.over <= 1.0
         ax.semilogy(profile.gain[within], profile.goal[within], "o", color=STYLES[0][0], label="limits kept")
@@ -176,8 +176,8 @@ def tradeoff(
 
     Args:
         sets: window errors (trials,) [-] and peak torques (trials,) [N m] by label.
-        limit: of the torque.
-        kind: of the plant; it determines the units.
+        limit: limit of the torque.
+        kind: kind of the plant, which determines the units.
         lower_bound: lower bound of the RMS error.
     """
     (convert, name, error_unit), unit = error_display(kind), CATALOGUES[kind]["peak_torque"].unit
@@ -209,7 +209,7 @@ def _legend_below(figure: Figure, entries: int, columns: int) -> None:
 
 
 def settling_by_angle(sets: Mapping[str, tuple[np.ndarray, np.ndarray]], t_f: float) -> Figure:
-    """Plot settling time against initial angle; label -> (initial angles [deg], settling times [s], NaN: never)."""
+    """Plot settling time [s] against initial angle [deg]; `sets`: label -> (angles, times), NaN: never settles."""
     figure, axes = new_figure("When it settles, by where it starts", "settling time [s]")
     for (label, (angle, time)), (colour, marker) in zip(sets.items(), _colours_and_markers(len(sets)), strict=True):
         settled, name = np.isfinite(time), label.replace("_", " ")
@@ -233,7 +233,7 @@ def front(
     """Plot window error against peak torque of a Pareto front, with intervals.
 
     Args:
-        points: of a `front.Front`, with rms, interval, peak, dominated and knee.
+        points: points of a `front.Front`, with rms, interval, peak, dominated and knee.
         others: further points by label.
         limit: required limit of the torque, if any.
         kind: kind of the plant, which determines the units.
@@ -275,7 +275,7 @@ def costs(
     """Plot the error and other metrics along a sweep, a panel each; dashed lines are the scenario's limits.
 
     Args:
-        points: of the sweep, with rms, interval and meets.
+        points: points of the sweep, with rms, interval and meets.
         sweep: the values of the points.
         panels: values of each point, NaN if it has none, and the limit if there is one, by title; the error first.
         kind: kind of the plant, which determines how the intervals of the error are shown.
@@ -320,7 +320,7 @@ def _draw_colour_map(axes: Any, x: MapAxis, y: MapAxis, grid: np.ndarray, same_s
     for line, map_axis in ((axes.xaxis, x), (axes.yaxis, y)):
         if not map_axis.logarithmic and all(float(value).is_integer() for value in map_axis.values):
             line.set_major_locator(matplotlib.ticker.MaxNLocator(integer=True))  # a delay is a whole number of periods
-    axes.set_facecolor("0.9")  # of pairs without a number; not a colour of the map
+    axes.set_facecolor("0.9")  # pairs without a number are grey, which is not a colour of the map
     mesh = axes.pcolormesh(x.edges, y.edges, np.ma.masked_invalid(grid), norm=norm, cmap="cividis")
     bar = axes.figure.colorbar(mesh, ax=axes, extend="max" if known.size and known.max() > high else "neither")
     plain_ticks(bar.ax.yaxis)
@@ -343,7 +343,7 @@ def accuracy_map(
         grids: (y, x) by name; grids without finite numbers are not drawn.
         failed: (y, x) bool, a trial failed or did not converge at t_f.
         limit_lines: lines (x, y) by label.
-        kind: of the plant; it determines the units.
+        kind: kind of the plant, which determines the units.
     """
     (convert, error, error_unit), unit = error_display(kind), CATALOGUES[kind]["peak_torque"].unit
     grids = {name: convert(grid) if "error" in name else grid for name, grid in grids.items()}

@@ -29,8 +29,8 @@ RC: Any = {
     "legend.frameon": False,
 }
 styled = matplotlib.rc_context(RC)  # decorator of functions that draw in this style
-LIMIT: Any = {"color": "0.3", "lw": 1.0, "ls": (0, (6, 3))}  # line of a limit; `LOWER_BOUND`: of a lower bound
-LOWER_BOUND: Any = {"color": "0.3", "lw": 1.0, "ls": ":"}
+LIMIT: Any = {"color": "0.3", "lw": 1.0, "ls": (0, (6, 3))}  # style of the line of a limit
+LOWER_BOUND: Any = {"color": "0.3", "lw": 1.0, "ls": ":"}  # style of the line of a lower bound
 WIDE_RATIO = 1e4  # ratio of an axis's ends above which numbers between powers of ten would overlap
 
 
@@ -57,10 +57,11 @@ def with_unit(name: str, unit: str) -> str:
     return f"{name} [{unit}]" if unit else name
 
 
-class _Decades(matplotlib.ticker.LogLocator):
-    """1, 2 and 5 times each power of ten; only the powers if there are more than four or they would overlap."""
+class _DecadeLocator(matplotlib.ticker.LogLocator):
+    """Ticks of a log axis at 1, 2 and 5 times powers of ten; at powers only if numbers would overlap or be too many."""
 
     def tick_values(self, vmin: float, vmax: float) -> Any:
+        """Return the ticks of an axis from vmin to vmax."""
         vmin, vmax = sorted((vmin, vmax))  # the axis may be inverted
         room = WIDE_RATIO if self.axis is None else 10.0 ** (self.axis.get_tick_space() / self._space(vmin, vmax))
         self.set_params(subs=(1.0,) if vmax > min(WIDE_RATIO, room) * vmin else (1.0, 2.0, 5.0))
@@ -83,7 +84,7 @@ def error_display(plant: str) -> tuple[Callable[[ArrayLike], np.ndarray], str, s
 
 def plain_ticks(line: Axis) -> None:
     """Use numbers such as 0.05 on a log axis."""
-    line.set_major_locator(_Decades())
+    line.set_major_locator(_DecadeLocator())
     line.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
     line.set_minor_formatter(matplotlib.ticker.NullFormatter())
 

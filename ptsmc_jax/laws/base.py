@@ -49,7 +49,8 @@ class Law(declare.Tunable):
     kinematics: Kinematics  # definition of the error that the law drives to zero
     t_f: Leaf  # prescribed time; for a law without it, the start of the evaluation of the error [s]
     delta: Leaf  # time between the hand-over and t_f [s]
-    tunable: ClassVar[tuple[str, ...]] = ("t_f",)  # fields that tuning may change; `gain` adds its fields
+    # names of the fields that tuning may change; fields that are declared by `gain` are added
+    tunable: ClassVar[tuple[str, ...]] = ("t_f",)
     prescribed: ClassVar[bool] = False  # whether the law is from the paper, with known exact solution and bounds
     switches: ClassVar[bool] = True  # whether its switching term uses the bound on the estimation error
 
@@ -112,7 +113,7 @@ class Law(declare.Tunable):
         return u, s, memory[0] if memory else now.memory
 
     def singularity_distance(self, x: Any, target: Any) -> Scalar:
-        """Return the distance to the singularity of the kinematics, or 1 if the law does not invert them."""
+        """Return the signed distance to the singularity of the kinematics; 1 if the law does not invert them."""
         if type(self).__call__ is not Law.__call__:
             return jnp.ones(())
         return self.kinematics.singularity_distance(x, target)
@@ -157,17 +158,17 @@ class Law(declare.Tunable):
         return published
 
     def refusal(self, order: int) -> tuple[str, str] | None:
-        """Check conditions on several fields, or on a field and the order of the plant.
+        """Return a field whose value conflicts with other fields or the plant's order, and its allowed values, or None.
 
-        Returns:
-            The name of a field whose value is not allowed, and the allowed values; or None.
+        Args:
+            order: order of the plant.
         """
         return None
 
 
 @dataclass(frozen=True)
 class AccelerationLaw(Law):
-    """Base of the laws for comparison and of custom laws, for an error of order 2 and the sampled loop."""
+    """Base of comparison and custom laws, which command the acceleration eps'' of an error in the sampled loop."""
 
     kinematics: Kinematics
     t_f: Leaf  # prescribed time; for a law without it, the start of the evaluation of the error [s]

@@ -110,7 +110,7 @@ class Terminal(ComparisonLaw):
         return math.hypot(position, velocity**self.p / self.b)
 
     def half_turn_rate(self, t_f: float) -> tuple[str, Scalar | float]:
-        """Return "b", and the body rate on the sliding surface at |v| = 1 [rad/s]."""
+        """Return "b", and the body rate [rad/s] on the sliding surface at the error |v| = 1."""
         return "b", 2.0 * self.b ** (1.0 / self.p)
 
 
@@ -165,7 +165,7 @@ class FixedTime(ComparisonLaw):
         return equivalent - bound * guards.smooth_sign(s, self.sign_width), s
 
     def half_turn_rate(self, t_f: float) -> tuple[str, Scalar | float]:
-        """Return "a1", and the body rate on the sliding surface at |v| = 1 [rad/s]."""
+        """Return "a1", and the body rate [rad/s] on the sliding surface at the error |v| = 1."""
         return "a1", 2.0 * (self.a1 + self.b1)
 
     def noise_of_s(self, position: float, velocity: float) -> float:
@@ -219,7 +219,7 @@ class Scaling(ComparisonLaw):
         return {**published, "delta": design.delta, "k1": design.pole}
 
     def half_turn_rate(self, t_f: float) -> tuple[str, Scalar | float]:
-        """Return "m", and the body rate at the start [rad/s]."""
+        """Return "m", and the body rate [rad/s] at t = 0 for |v| = 1 and eps' = -(p / t_f) eps."""
         return "m", 2.0 * (2.0 + self.m) / t_f
 
 
@@ -265,7 +265,8 @@ class PredefinedTime(ComparisonLaw):
         squares = error_rate * jnp.abs(error_rate) + 2.0 * surface * jnp.abs(surface)
         s = error_rate + guards.signed_root(squares, jnp.zeros_like(bound))
         magnitude = jnp.abs(error)
-        # Phi_1 Phi_1' without a negative power, which would be infinite at zero. For q1 = 1/2, |x|^(1 - 2 q1) is 1.
+        # The product Phi_1 Phi_1' of `phi` and its derivative, written without a negative power of |eps|, which would
+        # be infinite at zero. For q1 = 1/2, the factor |eps|^(1 - 2 q1) is 1.
         power = guards.signed_power(magnitude, 2.0 * self.q1)
         at_zero = (magnitude == 0.0) & (self.q1 >= 0.5)
         quotient = magnitude + jnp.where(at_zero, 1.0, guards.signed_power(magnitude, 1.0 - 2.0 * self.q1))
@@ -280,7 +281,7 @@ class PredefinedTime(ComparisonLaw):
         return {}
 
     def half_turn_rate(self, t_f: float) -> tuple[str, Scalar | float]:
-        """Return "q1", and the body rate on the sliding surface at |v| = 1 [rad/s]."""
+        """Return "q1", and the body rate [rad/s] on the sliding surface at the error |v| = 1."""
         return "q1", 2.0 * math.pi / (self.q1 * self.share * t_f)
 
 
@@ -333,5 +334,5 @@ class SuperTwisting(ComparisonLaw):
         return {**published, "sign_width": design.width}
 
     def half_turn_rate(self, t_f: float) -> tuple[str, Scalar | float]:
-        """Return "surface_rate", and the body rate on the sliding surface at |v| = 1 [rad/s]."""
+        """Return "surface_rate", and the body rate [rad/s] on the sliding surface at the error |v| = 1."""
         return "surface_rate", 2.0 * self.surface_rate

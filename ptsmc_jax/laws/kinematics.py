@@ -32,13 +32,12 @@ class Kinematics:
     """
 
     model: Any  # design model of the plant
-    additive: ClassVar[bool] = (
-        False  # the error is q_1 - q_1f, as in the paper; it is singular at body attitudes of 180 deg
-    )
+    # whether the error is q_1 - q_1f, as in the paper, which is singular at body attitudes of 180 deg
+    additive: ClassVar[bool] = False
     symbol: ClassVar[str] = "$|x_1|$"  # symbol of the error's norm in figures
     error_unit: ClassVar[str] = ""  # unit of error and sliding variable; empty if it depends on the plant
     angle_unit: ClassVar[str] = "x1"  # unit of `angle`
-    reaching_factor: ClassVar[float] = 1.0  # decay rate of s in the hold phase divided by K1; 1 in (29)
+    reaching_factor: ClassVar[float] = 1.0  # ratio of the decay rate of s in the hold phase to the gain K1; 1 in (29)
 
     @property
     def order(self) -> int:
@@ -172,7 +171,7 @@ class AdditiveKinematics(AttitudeKinematics):
         return x.q[:3] - target.q[:3], v_dot - reference_rate
 
     def influence(self, x: AttitudeState, target: Target) -> Scalar:
-        """Return |T(q) J^-1| / 2 of (57), with the Frobenius norm [1/(kg m^2)]."""
+        """Return |T(q) J^-1| / 2 of (57), a bound on the change of eps'' per torque; Frobenius norm [1/(kg m^2)]."""
         return 0.5 * guards.norm(attitude.t_matrix(x.q) @ self.model.inertia_inverse)
 
     def invert(self, x: AttitudeState, target: Target, acceleration: Vector, d_hat: Vector) -> Vector:

@@ -76,7 +76,7 @@ class PrescribedTimeLaw(Law):
         return {"eta": design.eta, "delta": design.delta, **gains}
 
     def half_turn_rate(self, t_f: float) -> tuple[str, Scalar | float]:
-        """Return "eta", and the body rate on the sliding surface at t = 0 [rad/s]."""
+        """Return "eta", and the body rate [rad/s] on the sliding surface at t = 0 with the error |v| = 1."""
         return "eta", 2.0 * self.eta / t_f
 
     @property
@@ -130,7 +130,7 @@ class PrescribedTimeLaw(Law):
         ends_in_hold = self.in_hold(now.t, now.t + now.dt, now.hold)
         before = jnp.where(ends_in_hold, at_hand_over, self.remaining_fraction(now) ** power * s)
         target = jnp.where(now.hold, jnp.exp(-self.reaching_rate * now.dt) * s, before)
-        # if `switching` is 0, the derivative is 1 everywhere, also at target = 0
+        # in this form the derivative by the target is 1 without a switching term, also at target = 0
         return jnp.where(jnp.abs(target) < switching, 0.0, target - switching * jnp.sign(target))
 
     def in_hold(self, t: Array, t_next: Array, hold: Bool[Array, "..."]) -> Bool[Array, "..."]:
@@ -145,7 +145,7 @@ class PrescribedTimeLaw(Law):
         return jnp.where(hold, 1.0, self.t_f - t)
 
     def remaining_fraction(self, now: Sample) -> Scalar:
-        """Return the fraction r of the time to t_f that remains at the end of the period [-]; 1 in the hold phase.
+        """Return the ratio r of the times to t_f at the end and at the start of the period [-]; 1 in the hold phase.
 
         The remaining time is at least 1e-9 periods, so that powers of r and divisions by them are finite.
         """
@@ -219,13 +219,13 @@ class PrescribedTime(PrescribedTimeLaw):
     def _implicit_acceleration(
         self, now: Sample, error: Vector, error_rate: Vector, s: Vector, bound: Scalar
     ) -> Vector:
-        """Return the constant eps'' (m,) that makes s equal to `next_s` at the end: s+ = s_0 + g eps''."""
+        """Return eps'' (m,), constant in the period, that makes s equal to `next_s` at its end: s+ = s_0 + g eps''."""
         h, r = now.dt, self.remaining_fraction(now)
         end = self.gains(now.t + h, self.in_hold(now.t, now.t + h, now.hold))
         s_0 = end.c * error_rate + end.e * (error + h * error_rate)  # s at the end without acceleration
         g = h * end.c + end.e * h**2 / 2.0
-        # In the approach phase, eps decays like r^eta on s = 0. The target at the hand-over uses the measured rate
-        # instead of eta / delta times the attitude error, which would amplify the noise of the attitude.
+        # On s = 0, eps decays like r^eta in the approach phase, and its rate is -eta / tau times eps. The target of s
+        # at the hand-over uses the measured rate, because this product would amplify the noise of the attitude.
         at_hand_over = r ** (self.eta - 1.0) * (error_rate + self.surface_rate * r * error)
         return (self.next_s(now, s, at_hand_over, self.eta, g * bound) - s_0) / g
 
@@ -306,7 +306,7 @@ class PrescribedTimeChain(PrescribedTimeLaw):
         return -equivalent - k2 * guards.smooth_sign(s, self.layer_width(now.hold))
 
     def _implicit_rate(self, now: Sample, x: Float[Array, " n"], s: Vector, k2: Scalar) -> Vector:
-        """Return the constant x_n' (1,) that makes s equal to `next_s` at the end: s+ = s_0 + g x_n'."""
+        """Return x_n' (1,), constant in the period, that makes s equal to `next_s` at its end: s+ = s_0 + g x_n'."""
         n, h, c, r = self.order, now.dt, surface_coefficients(self.eta, self.order), self.remaining_fraction(now)
         # the state at the end of the period is free + x_n' forced, by the Taylor series of a chain
         free = [sum(h ** (j - i) / math.factorial(j - i) * x[j] for j in range(i, n)) for i in range(n)]

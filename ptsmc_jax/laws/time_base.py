@@ -54,7 +54,7 @@ class TimeBase(ComparisonLaw):
         return ProfileStart(jnp.zeros(()), zero, zero)
 
     def profile(self, start: ProfileStart, t: Scalar) -> Profile:
-        """Return the profile at the time t [s], for initial values `start`, with rates [1/s] and [1/s^2]."""
+        """Return the desired error at the time t [s] and its derivatives, for a profile that begins at `start`."""
 
         def error(t: Scalar) -> Vector:
             x = jnp.minimum(t / self.t_f, 1.0)
@@ -75,7 +75,7 @@ class TimeBase(ComparisonLaw):
         Args:
             deviation: E = eps - r, (m,).
             rate: E' [1/s], (m,).
-            bound: see `Law.acceleration`.
+            bound: bound on the 2-norm of the disturbance that is not estimated, in the units of the acceleration.
 
         Returns:
             a - r'' and s, (m,) each.

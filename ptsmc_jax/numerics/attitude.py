@@ -44,7 +44,7 @@ def conjugate(q: Quaternion) -> Quaternion:
 @jax.jit
 def normalise(q: Quaternion) -> Quaternion:
     """Unit quaternion q / |q| [-]."""
-    return q * (1.0 / jnp.sqrt(jnp.dot(q, q)))  # one division, not four
+    return q * (1.0 / jnp.sqrt(jnp.dot(q, q)))  # one division instead of four
 
 
 def unit(q: Quaternion) -> Quaternion:
@@ -57,7 +57,7 @@ def unit(q: Quaternion) -> Quaternion:
 def rotate(q: Quaternion, y: Vector) -> Vector:
     """Rotate a vector from body axes to inertial axes: R(q) y, in the units of y."""
     v, s = q[:3], q[3]
-    # With a single cross product: XLA repeats nested ones at each use, which made programs of two million lines.
+    # The formula has no nested cross product, because XLA repeats it at each use: programs had two million lines.
     return (1.0 - 2.0 * jnp.dot(v, v)) * y + 2.0 * (jnp.dot(v, y) * v + s * cross(v, y))
 
 

@@ -36,6 +36,7 @@ class Key(NamedTuple):
 
 
 def _to_word(value: WholeNumber) -> Array:
+    """Return a seed, trial or sample as an unsigned 32-bit integer."""
     check_fits("a seed, trial or sample", value)
     if isinstance(value, int):
         return jnp.asarray(np.uint32(value & 0xFFFFFFFF), dtype=jnp.uint32)
@@ -113,8 +114,8 @@ def streams(seed: WholeNumber, trial: WholeNumber, names: Sequence[str]) -> list
     """Return the keys of several random streams of a trial, with less code to compile than calls of `stream`.
 
     Args:
-        seed: see `stream` [-].
-        trial: see `stream` [-].
+        seed: whole number that selects the random numbers, together with `trial` [-].
+        trial: number of the trial [-].
         names: names of the streams.
     """
     seed, trial = _to_word(seed), _to_word(trial)
@@ -158,12 +159,12 @@ def _normal_pair(a: Word, b: Word) -> tuple[Array, Array]:
 
 
 Distribution = Literal["uniform", "normal"]
-# functions (word, word) -> two numbers
+# functions that convert two words to two random numbers
 DISTRIBUTIONS: dict[Distribution, Callable] = {"uniform": _uniform_pair, "normal": _normal_pair}
 
 
 def _interleave(pairs: tuple[Array, Array], count: int) -> Array:
-    """Return the first `count` numbers of pairs: two arrays (blocks,) become a_0, b_0, a_1, b_1, ..."""
+    """Return the first `count` of the numbers a_0, b_0, a_1, b_1, .. from two arrays a and b (blocks,)."""
     return jnp.stack(pairs, axis=1).reshape(-1)[:count]
 
 
@@ -209,9 +210,9 @@ def draw_streams(
     One loop computes all numbers. It takes a fraction of the code that separate calls compile.
 
     Args:
-        seed: see `stream` [-].
-        trial: see `stream` [-].
-        distribution: of the numbers.
+        seed: whole number that selects the random numbers, together with `trial` [-].
+        trial: number of the trial [-].
+        distribution: distribution of the numbers.
         counts: how many numbers, by the name of the stream.
 
     Returns:

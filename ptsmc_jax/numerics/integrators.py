@@ -37,8 +37,9 @@ def rk4(rate: Callable[[Scalar, Any], Any], t: Scalar, y: Any, dt: Scalar, *, ro
 
 
 def _rolled_rk4(rate: Callable[[Scalar, Any], Any], t: Scalar, y: Any, dt: Scalar) -> Any:
-    def stage(k: Array | int, rates: tuple[Any, Any]) -> tuple[Any, Any]:
-        previous, total = rates
+    def stage(k: Array | int, previous_and_total: tuple[Any, Any]) -> tuple[Any, Any]:
+        """Return the rate of stage k, and the weighted sum of the rates of the stages 0 to k."""
+        previous, total = previous_and_total
         offset = dt * jnp.where(k == 0, 0.0, jnp.where(k == 3, 1.0, 0.5))
         weight = jnp.where((k == 0) | (k == 3), 1.0, 2.0)
         current = rate(t + offset, _add_scaled(y, previous, offset))
@@ -72,9 +73,9 @@ def hermite_middle(start: Array, start_rate: Array, end: Array, end_rate: Array,
     return (start + end) / 2 + dt / 8 * (start_rate - end_rate)
 
 
-_TERMS = 15  # of the Taylor series, whose remainder is below 2^-16 / 15! at a norm of at most 1/2
-_DOUBLINGS = 40  # the largest number, for norms up to 2^39
-_USUAL_DOUBLINGS = 4  # for norms up to 8; few matrices have a larger norm
+_TERMS = 15  # terms of the Taylor series, whose remainder is below 2^-16 / 15! at a norm of at most 1/2
+_DOUBLINGS = 40  # largest number of doublings, for norms up to 2^39
+_USUAL_DOUBLINGS = 4  # doublings for norms up to 8; few matrices have a larger norm
 
 
 @partial(jax.jit, static_argnames="order")
@@ -102,7 +103,7 @@ def phi_functions(x: Float[Array, "n n"], order: int, largest: Scalar | None = N
     doublings = jnp.clip(jnp.ceil(jnp.log2(jnp.maximum(size, 0.5))) + 1.0, 0.0, _DOUBLINGS)
     small = x * 2.0**-doublings
     top = identity / float(factorial(order + _TERMS))
-    # A loop is compiled once instead of once for each term.
+    # JAX compiles the body of a loop once; without the loop it would compile every term.
     terms = jnp.asarray([1.0 / factorial(order + k) for k in range(_TERMS - 1, -1, -1)], x.dtype)
     top, _ = jax.lax.scan(lambda top, term: (term * identity + small @ top, None), top, terms)
     phi = [top]
@@ -136,7 +137,7 @@ class Decay(NamedTuple):
     half: Array  # e^(-A dt/2) [-]
     full: Array  # e^(-A dt) [-]
     stage: Array  # dt/2 phi_1(-A dt/2) [s]
-    ends: tuple[Array, Array, Array]  # weights of the forcing at the start, the middle (twice) and the end [s]
+    ends: tuple[Array, Array, Array]  # weights of g at the start, of each of two g at the middle, and at the end [s]
 
 
 def decay(a: Float[Array, "n n"], dt: Scalar, largest: Scalar | None = None) -> Decay:

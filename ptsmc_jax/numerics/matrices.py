@@ -48,7 +48,7 @@ def _eliminate(a: Array, b: Array) -> tuple[Array, Array]:
     return jnp.stack(right), determinant
 
 
-SWEEPS = 8  # over all pairs of axes; 5 or 6 reach full precision, because the convergence is quadratic
+SWEEPS = 8  # Jacobi sweeps over all pairs of axes; 5 or 6 reach full precision, as the convergence is quadratic
 
 
 @jax.jit

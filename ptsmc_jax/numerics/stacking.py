@@ -27,7 +27,7 @@ def scan(step: Callable[[Any, Any], tuple[Any, Any]], init: Any, xs: Any, **opti
     """
     if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
         return lax.scan(step, init, xs, **options)
-    recorded: list[Any] = []  # structure of the outputs of one step, and their abstract values
+    recorded: list[Any] = []  # tracing a step writes the structure of its outputs and their abstract values here
 
     def step_packed(carry: Any, x: Any) -> tuple[Any, dict[str, Any]]:
         carry, y = step(carry, x)

@@ -16,7 +16,7 @@ SOBOL_BINS = 32  # bins of an input with equal numbers of trials
 DUPLICATE_CORRELATION = 0.9999  # rank correlation above which two inputs are duplicates
 MIN_EXPLAINED = 0.05  # fraction of the variance of a metric's ranks that an input must explain to be named in reports
 SIGNIFICANCE = 0.0027  # probability of a normal number beyond three sigma, the level of the test of categories
-ROUNDING = 1e-12  # relative to the largest value: smaller differences between values are rounding errors
+ROUNDING = 1e-12  # largest difference of values that is a rounding error, divided by the largest value
 
 
 def fraction_interval(successes: int, trials: int, confidence: float) -> tuple[float, float]:
@@ -73,7 +73,7 @@ def mean_bound(fractions: np.ndarray, confidence: float) -> float:
     low = float(fractions.min())
     if low == 1.0:
         return 1.0
-    # Shifted and scaled so that 0 and 1 are always among the numbers. The quantile of a weighted mean scales with them.
+    # The numbers are shifted and scaled, so that 0 and 1 are among them. The quantile of a weighted mean scales too.
     x, counts = np.unique(np.append((fractions - low) / (1.0 - low), 1.0), return_counts=True)
     if x.size == 2:
         return low + (1.0 - low) * (1.0 - fraction_bound(int(counts[0]), fractions.size, confidence))
@@ -96,9 +96,9 @@ def _tilted_mean(x: np.ndarray, counts: np.ndarray, tilt: float) -> tuple[float,
         counts: how often each value occurs, (values,).
         tilt: 0 for the plain mean; positive tilts move X towards the largest value.
     """
-    t, scale = -np.expm1(-tilt), (1.0 - x) + x * np.exp(-tilt)  # 1 - t x
+    t, scale = -np.expm1(-tilt), (1.0 - x) + x * np.exp(-tilt)  # scale is 1 - t x
     total = np.sum(counts / scale)
-    rest = np.sum(counts * (1.0 - x) / scale) / total  # 1 - X
+    rest = np.sum(counts * (1.0 - x) / scale) / total  # rest is 1 - X
     weights = (rest - (1.0 - x)) / scale
     variance = np.sum(counts * weights**2)
     u = t * np.sqrt(variance)

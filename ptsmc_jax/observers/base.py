@@ -39,9 +39,9 @@ class Bound(Protocol):
 class ErrorBound(NamedTuple):
     """The bound K2(t) = e^(-rate t) start + (1 - e^(-rate t)) floor, the corrected form of (55)."""
 
-    rate: Array  # l_m [1/s]
+    rate: Array  # l_m, decay rate of the initial bound [1/s]
     start: Array  # bound at t = 0 [N m]
-    floor: Array  # bound for large t [N m]
+    floor: Array  # limit of the bound for large t [N m]
 
     @property
     def largest(self) -> Scalar:
@@ -65,10 +65,9 @@ class Observer(declare.Tunable, ABC):
     """Base class of the disturbance observers. The memory is a separate value, see `begin` and `update`."""
 
     model: Plant  # design model of the plant
-    estimates: ClassVar[bool] = True  # whether d_hat can differ from 0
-    linear: ClassVar[bool] = (
-        False  # the estimate is linear in the measurements, and K2 is inversely proportional to the gain
-    )
+    estimates: ClassVar[bool] = True  # whether the observer estimates anything: d_hat can differ from 0
+    # whether the estimate is linear in the measurements, and K2 is inversely proportional to the gain
+    linear: ClassVar[bool] = False
 
     def begin(self) -> Memory:
         """Return the memory at t = 0, with d_hat = 0 [N m]."""
@@ -92,7 +91,7 @@ class Observer(declare.Tunable, ABC):
         Args:
             t: time [s].
             span: begin and end of the step [s].
-            memory: the memory m.
+            memory: memory m of the observer.
             d_eff: disturbance of the design model, (m,) [N m].
         """
         raise NotImplementedError
@@ -173,7 +172,7 @@ class LinearObserver(Observer):
         return self.gain[:, None] * self.model.inertia_inverse
 
     def _linear_bound(self) -> ErrorBound:
-        """Return the corrected form of (55).
+        """Return the bound K2(t) by the corrected form of (55).
 
         (55) needs sqrt(m) c instead of c, because c bounds each component of d' and K2 bounds the 2-norm of the error.
         l_m is the smallest eigenvalue of l^1/2 J^-1 l^1/2, and the bound has the factor sqrt(cond(l)). For a diagonal J

@@ -20,9 +20,9 @@ _OVERSHOOT = (0.159, 0.185, 0.212, 0.240, 0.270, 0.301, 0.336, 0.374, 0.417, 0.4
 class FiniteTimeBound(NamedTuple):
     """The bound K2(t) of `FiniteTimeObserver`: |e(0)| until the settling time, then the error of the boundary layer."""
 
-    start: Array  # bound on |e(0)|_2 [N m]
-    settled: Array  # settling time [s]
-    floor: Array  # bound after it, without sensor noise [N m]
+    start: Array  # bound on the 2-norm of the initial error e(0) [N m]
+    settled: Array  # time after which the error is within `floor` [s]
+    floor: Array  # bound after the time `settled`, without sensor noise [N m]
 
     @property
     def largest(self) -> Scalar:

@@ -23,9 +23,9 @@ class PrescribedTimeBound(NamedTuple):
     """
 
     base: ErrorBound  # bound of the observer without the time-varying gain
-    mu: Array  # [-]
-    t_o: Array  # [s]
-    delta_o: Array  # [s]
+    mu: Array  # exponent of the convergence [-]
+    t_o: Array  # prescribed time of convergence T_o [s]
+    delta_o: Array  # time before T_o at which the time-varying gain is switched off [s]
 
     @property
     def largest(self) -> Scalar:
@@ -87,7 +87,10 @@ class PrescribedTimeObserver(LinearObserver):
         return self._constant_decay() + self._mean_rate(t, t_next) * jnp.eye(self.model.inputs)
 
     def forcing(self, t: Scalar, span: tuple[Scalar, Scalar], memory: Memory, d_eff: Vector) -> Memory:
-        """Return A(t) d_eff - (A(t) - A) d_hat [N m/s], with the mean A. No step contains T_o - delta_o inside."""
+        """Return the forcing A(t) d_eff - (A(t) - A) d_hat of d_hat' + A d_hat [N m/s]; A is the mean over the step.
+
+        A step ends or begins at T_o - delta_o, where mu/(T_o - t) is switched off; no step contains that time inside.
+        """
         early = 0.5 * (span[0] + span[1]) < self.t_o - self.delta_o
         rate = jnp.where(early, self.mu / self._time_left(t), 0.0)
         deviation = rate - self._mean_rate(*span)

@@ -34,14 +34,14 @@ class Plant(ABC):
     these methods and fields only.
     """
 
-    inertia: Any  # (m, m)
-    inertia_inverse: Any  # (m, m)
+    inertia: Any  # (m, m) scale of observer gains, and M unless `mass` is overridden
+    inertia_inverse: Any  # (m, m) inverse of `inertia`
     custom_functions: ClassVar[bool] = False  # whether users define its equations, so that its time scales are unknown
     input_name: ClassVar[str] = "control"
     input_unit: ClassVar[str] = ""  # unit of inputs and disturbances; empty: custom units
     # names and meanings of the parts of a state that sensors measure
     signals: ClassVar[dict[str, str]] = {"x": "the measured state, in its own units"}
-    largest_measurement: ClassVar[float] = 1e12  # exported flight software refuses larger numbers
+    largest_measurement: ClassVar[float] = 1e12  # exported flight software rejects larger measured numbers
     # rounding error of an error near zero, which is a difference of measured numbers, in units of the resolution
     error_rounding: ClassVar[float] = 0.0
     charts: ClassVar[tuple[Chart, ...]] = (Chart("states", "States", "state", "x"),)
@@ -86,7 +86,7 @@ class Plant(ABC):
         """Return the input for this w' and disturbance d."""
 
     def implied_disturbance(self, t: Scalar, x: State, x_dot: State, u: Float[Array, " m"]) -> Float[Array, " m"]:
-        """Return the disturbance M w' - f(t, x, u) of a motion."""
+        """Return the disturbance M w' - f(t, x, u) that explains a motion with the state derivative `x_dot`."""
         return self.mass(t, x) @ self.velocity(x_dot) - self.generalised_force(t, x, u)
 
     def implied_disturbance_impulse(

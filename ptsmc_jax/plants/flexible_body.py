@@ -17,8 +17,8 @@ from ptsmc_jax.plants.rigid_body import AttitudeState, Spacecraft
 class Modes(NamedTuple):
     """Modal coordinates of a flexible body, normalised to a modal mass of 1."""
 
-    e: Array  # (n,) [sqrt(kg) m]
-    rate: Array  # (n,) e' [sqrt(kg) m/s]
+    e: Array  # (n,) modal coordinates [sqrt(kg) m]
+    rate: Array  # (n,) time derivatives e' [sqrt(kg) m/s]
 
 
 @pytree
@@ -35,10 +35,10 @@ class FlexibleSpacecraft(Spacecraft):
     `input_for` neglects the motion of the modes.
     """
 
-    frequency: Leaf  # (n,) W, with the body held [rad/s]
-    damping: Leaf  # (n,) z [-]
-    coupling: Leaf  # (n, 3) D [sqrt(kg) m]
-    rest_inverse: Leaf  # (3, 3) (J - D'D)^-1 [1/(kg m^2)]
+    frequency: Leaf  # (n,) W, angular frequencies of the modes while the body is held [rad/s]
+    damping: Leaf  # (n,) z, damping ratios of the modes [-]
+    coupling: Leaf  # (n, 3) D, coupling of modes and rotation [sqrt(kg) m]
+    rest_inverse: Leaf  # (3, 3) inverse of `rest_inertia`, (J - D'D)^-1 [1/(kg m^2)]
 
     def force(self, modes: Modes) -> Float[Array, " n"]:
         """Return the force of springs and dampers on the modes, 2 z W e' + W^2 e [sqrt(kg) m/s^2]."""

@@ -24,13 +24,13 @@ class System(Plant):
     x_1 is an error. M is D^-1. Build it with `system`.
     """
 
-    F: Any  # -> (n,)
-    H: Any  # -> (n,)
-    G: Any  # -> (n, n)
-    D: Any  # -> (n, n), or None for the identity
+    F: Any  # function that returns x_1', (n,)
+    H: Any  # function that returns x_2' without input and disturbance, (n,)
+    G: Any  # function that returns the matrix of the input u, (n, n)
+    D: Any  # function that returns the matrix of the disturbance d, (n, n); None: the identity
     custom_functions: ClassVar[bool] = True
-    inertia: Leaf  # (n, n) scale of observer gains, by default the identity
-    inertia_inverse: Leaf  # (n, n)
+    inertia: Leaf  # (n, n) matrix that scales observer gains, by default the identity
+    inertia_inverse: Leaf  # (n, n) inverse of `inertia`
 
     @property
     def state_shapes(self) -> dict[str, tuple[int, ...]]:
@@ -65,19 +65,19 @@ class System(Plant):
         return jax.jvp(lambda t, x_1: self.F(t, x_1, x_2), (t, x_1), rates)[1]
 
     def drift(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, " n"]:
-        """Return H."""
+        """Return H, which is x_2' without input and disturbance."""
         return self.H(t, *self.split(x))
 
     def input_gain(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, "n n"]:
-        """Return G."""
+        """Return G, the matrix of the input in x_2'."""
         return self.G(t, *self.split(x))
 
     def disturbance_gain(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, "n n"]:
-        """Return D."""
+        """Return D, the matrix of the disturbance in x_2'."""
         return jnp.eye(self.inputs) if self.D is None else self.D(t, *self.split(x))
 
     def mass(self, t: Scalar, x: Float[Array, " twice"]) -> Float[Array, "n n"]:
-        """Return D^-1."""
+        """Return the matrix M of `Plant`, which is D^-1."""
         one = jnp.eye(self.inputs)
         return one if self.D is None else matrices.solve(self.disturbance_gain(t, x), one)
 
@@ -86,7 +86,7 @@ class System(Plant):
         return self.drift(t, x) + self.input_gain(t, x) @ u
 
     def generalised_force(self, t: Scalar, x: Float[Array, " twice"], u: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Return D^-1 (H + G u)."""
+        """Return the force f of `Plant`, which is D^-1 (H + G u)."""
         rate = self.undisturbed_rate(t, x, u)
         return rate if self.D is None else matrices.solve(self.disturbance_gain(t, x), rate)
 
@@ -130,8 +130,8 @@ class HiddenSystem(System):
     state (2n + k,) is x_1, x_2, z. At t = 0 z is z0.
     """
 
-    Z: Any  # -> (k,)
-    z0: Leaf  # (k,)
+    Z: Any  # function that returns z', (k,)
+    z0: Leaf  # (k,) hidden states at t = 0
 
     @property
     def state_shapes(self) -> dict[str, tuple[int, ...]]:
@@ -139,11 +139,11 @@ class HiddenSystem(System):
         return {"": (2 * self.inputs + self.z0.shape[-1],)}
 
     def drift(self, t: Scalar, x: Float[Array, " whole"]) -> Float[Array, " n"]:
-        """Return H."""
+        """Return H, which is x_2' without input and disturbance."""
         return self.H(t, *self.split(x), x[2 * self.inputs :])
 
     def hidden_rates(self, t: Scalar, x: Float[Array, " whole"], u: Float[Array, " n"]) -> tuple[Array, ...]:
-        """Return the derivative Z of z."""
+        """Return the time derivative Z of the hidden states z."""
         return (self.Z(t, *self.split(x), x[2 * self.inputs :], u),)
 
     def visible(self, x: Float[Array, " whole"]) -> Float[Array, " twice"]:
@@ -159,7 +159,7 @@ class HiddenSystem(System):
         return jnp.append(visible, self.z0)
 
     def hidden_columns(self, x: Array | np.ndarray) -> dict[str, ArrayLike]:
-        """Return the states z."""
+        """Return the hidden states z."""
         return {"z": x[..., 2 * self.inputs :]}
 
 

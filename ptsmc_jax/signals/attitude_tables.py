@@ -55,7 +55,7 @@ class TableReference(Reference):
         s_dot = d_0 + x * (2.0 * a + 3.0 * x * b)
         s_ddot = (2.0 * a + 6.0 * x * b) / h
         square, inverse = jnp.dot(s, s), attitude.conjugate(s)
-        # s* s' / |s|^2 is q* q' plus a scalar
+        # for q = s / |s|, the quaternion q* q' is s* s' / |s|^2 plus a scalar, so their vector parts are equal
         w = 2.0 * attitude.multiply(inverse, s_dot)[:3] / square
         w_dot = 2.0 * attitude.multiply(inverse, s_ddot)[:3] / square - 2.0 * jnp.dot(s, s_dot) / square * w
         to_body = attitude.conjugate(self.q)
@@ -109,7 +109,7 @@ def sample_rates(times: np.ndarray, samples: np.ndarray, ends: np.ndarray | None
     Args:
         times: (n,) [s].
         samples: (n, 4) unit quaternions without jumps of their signs.
-        ends: see `interpolate_attitude`.
+        ends: rates at the first and the last sample, as in `interpolate_attitude`.
     """
     return body_rates(samples, _spline_rates(times, samples, ends))
 
@@ -121,7 +121,7 @@ def body_rates(q: np.ndarray, q_dot: np.ndarray) -> np.ndarray:
 
 
 def _quaternion_rate(q: np.ndarray, w: np.ndarray) -> np.ndarray:
-    """Return the time derivative (4,) [1/s] of a quaternion (4,) that turns with the rate w (3,) [rad/s]."""
+    """Return the time derivative (4,) [1/s] of a quaternion (4,) for the rate w (3,) [rad/s] in body axes."""
     return 0.5 * np.append(q[3] * w + np.cross(q[:3], w), -np.dot(q[:3], w))
 
 

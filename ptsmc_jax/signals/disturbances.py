@@ -26,7 +26,7 @@ class Disturbance:
         """Return the disturbance (m,) [N m] at the time t [s] in the state x."""
         raise NotImplementedError
 
-    # the name of the field that a dispersion changes, for the quantities "phase" and "amplitude"
+    # name of the field that a dispersion of the quantity "phase" or "amplitude" changes
     drawn: ClassVar[Mapping[str, str]] = {}
 
     def fastest(self) -> float:
@@ -34,7 +34,7 @@ class Disturbance:
         return 0.0
 
     def impulse(self, end: float) -> float:
-        """Return a bound on its integral until `end` [s], in N m s, or 0 if it is neglected."""
+        """Return a bound on the disturbance's integral until `end` [s], in N m s; 0: the disturbance is neglected."""
         return 0.0
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray] | None:
@@ -117,7 +117,7 @@ class Sinusoid(Disturbance):
         return float(np.max(np.abs(self.frequency)))
 
     def impulse(self, end: float) -> float:
-        """Return a bound on the impulse: that of half a period at most, plus that of the constant part [N m s]."""
+        """Return a bound on the integral: at most half a period of the sinusoid, and the constant part [N m s]."""
         effective_time = np.minimum(end, 2.0 / np.maximum(np.abs(self.frequency), 1e-12))
         return float(np.linalg.norm(np.abs(self.amplitude) * effective_time) + np.linalg.norm(self.bias) * end)
 
@@ -137,7 +137,7 @@ class GravityGradient(Disturbance):
     orbit: z is the orbit normal, and x is the direction in which the phase is zero.
     """
 
-    inertia: Leaf  # (3, 3) of the true body [kg m^2]
+    inertia: Leaf  # (3, 3) inertia of the true body [kg m^2]
     orbit: Leaf  # (4,) quaternion of the orbit frame: z is the orbit normal, x the direction of phase zero
     orbit_rate: Leaf = number(
         None, above=0.0, at_most=1.0, unit="rad/s", meaning="mean motion n; default: 1.1e-3, or of [orbit]"
@@ -164,7 +164,7 @@ class KeplerGravityGradient(Disturbance):
     c is the unit vector to the planet in body axes.
     """
 
-    inertia: Leaf  # (3, 3) of the true body [kg m^2]
+    inertia: Leaf  # (3, 3) inertia of the true body [kg m^2]
     orbit: Orbit
 
     def __call__(self, t: Scalar, x: AttitudeState) -> Float[Array, "3"]:

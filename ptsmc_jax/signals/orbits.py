@@ -20,7 +20,7 @@ from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 
 EARTH_RATE = 7.292115e-5  # rotation rate of the Earth, WGS-84 [rad/s]
 EQUATORIAL_RADIUS, FLATTENING = 6_378_137.0, 1.0 / 298.257223563  # WGS-84 ellipsoid [m, -]
-DAY = 86_400.0  # [s]
+DAY = 86_400.0  # length of a day [s]
 OBLIQUITY = np.deg2rad(23.4392911)  # angle between ecliptic and equator at J2000 [rad]
 HALLEY_ITERATIONS = 4  # these solve Kepler's equation up to rounding, for eccentricities of at most 0.9
 NEWTON_ITERATIONS = 2  # further iterations; only these are differentiated
@@ -45,7 +45,7 @@ class Place(NamedTuple):
 class Orbit:
     """A Keplerian orbit, and the rotation angle of the Earth, both at t = 0."""
 
-    mean_anomaly: Leaf  # at t = 0 [rad]
+    mean_anomaly: Leaf  # mean anomaly at t = 0 [rad]
     earth_angle: Leaf = number(
         None, unit="rad", meaning="Earth rotation angle at t = 0; default: from loop.epoch, or 0 without it"
     )
@@ -86,7 +86,7 @@ class Orbit:
         node, tilt, angle = self.ascending_node, self.inclination, self.perigee + anomaly
         cosine, sine = xp.cos(angle), xp.sin(angle)
         zero = 0.0 * angle
-        x = xp.stack([xp.cos(node) + zero, xp.sin(node) + zero, zero], axis=-1)  # to the ascending node
+        x = xp.stack([xp.cos(node) + zero, xp.sin(node) + zero, zero], axis=-1)  # unit vector to the ascending node
         up = xp.sin(tilt) + zero
         y = xp.stack([-xp.cos(tilt) * xp.sin(node) + zero, xp.cos(tilt) * xp.cos(node) + zero, up], axis=-1)
         cosine, sine = cosine[..., None], sine[..., None]
@@ -94,7 +94,7 @@ class Orbit:
         return Place(cosine * x + sine * y, cosine * y - sine * x, radius, anomaly)
 
     def quaternion(self, t: Scalar) -> Float[Array, "4"]:
-        """Return the quaternion (4,) [-] from the axes radial, along, normal to inertial axes at the time t [s].
+        """Return the quaternion (4,) [-] from orbit axes (radial, along-track, normal) to inertial axes at t [s].
 
         It has no jumps after a revolution.
         """
@@ -183,7 +183,7 @@ class Direction:
 class Fixed(Direction):
     """A constant direction."""
 
-    vector: Any  # (3,)
+    vector: Any  # (3,) vector in this direction, in inertial axes
     needs_orbit: ClassVar[bool] = False
 
     def __call__(self, t: Any, place: Any, orbit: Any, xp: Any) -> Any:
@@ -223,7 +223,7 @@ class OrbitNormal(Direction):
 class GroundPoint(Direction):
     """The direction from the spacecraft to a point on the rotating Earth."""
 
-    point: Any  # (3,) Earth-fixed coordinates [m]
+    point: Any  # (3,) Earth-fixed coordinates of the point [m]
 
     def __call__(self, t: Any, place: Any, orbit: Any, xp: Any) -> Any:
         angle = orbit.earth_angle + EARTH_RATE * t
@@ -238,8 +238,8 @@ class GroundPoint(Direction):
 class Sun(Direction):
     """The direction from the Earth to the Sun, to 0.01 deg (Astronomical Almanac, low-precision formulas)."""
 
-    longitude: Any  # mean longitude at t = 0 [rad]
-    anomaly: Any  # mean anomaly at t = 0 [rad]
+    longitude: Any  # mean longitude of the Sun at t = 0 [rad]
+    anomaly: Any  # mean anomaly of the Sun at t = 0 [rad]
     needs_orbit: ClassVar[bool] = False
 
     def __call__(self, t: Any, place: Any, orbit: Any, xp: Any) -> Any:

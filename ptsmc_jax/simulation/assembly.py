@@ -33,12 +33,12 @@ class Setup:
     initial: Any  # state of the plant
     t_end: Leaf  # [s]
     window: Leaf  # length of the window after t_f, for window_error [s]
-    settling_angle: Leaf  # limit of the angle for `settling_time` [rad]
+    settling_angle: Leaf  # a run has settled when its angle stays below this limit, for `settling_time` [rad]
     actuators: Actuators = field(default_factory=Actuators)  # by default they hold the commanded torque over a period
     walk_rate: Leaf | None = None  # (m,) 1 sigma of a random-walk step of the disturbance per period length [N m/s]
     command_filter: CommandFilter | None = None  # filter between the law and the actuators
     jitter: Leaf | None = None  # largest error of a sample time, as a fraction of the control period [-]
-    pointing: Pointing | None = None  # None: pointing errors are not observed
+    pointing: Pointing | None = None  # observation of pointing errors; None: the run has no pointing metrics
 
     def __post_init__(self) -> None:
         """Wrap functions of time as pytrees."""
@@ -53,7 +53,7 @@ class Setup:
         return self.controller.kinematics.align(self.initial, self.reference(jnp.zeros_like(self.t_end)))
 
     def with_t_f(self: _Setup, t_f: Leaf) -> _Setup:
-        """Return the parts with another prescribed time [s]. The time from t_f to t_end stays the same."""
+        """Return the parts with another prescribed time [s]; t_end moves with it."""
         t_end = t_f + (self.t_end - self.controller.t_f)
         return replace(self, controller=replace(self.controller, t_f=t_f), t_end=t_end)
 
@@ -110,6 +110,6 @@ class Parts(Setup):
         return clock.period
 
     def with_t_f(self, t_f: Leaf) -> "Parts":
-        """Return the parts with another prescribed time [s]. The time from t_f to t_end stays the same."""
+        """Return the parts with another prescribed time [s]; t_end moves with it."""
         parts = super().with_t_f(t_f)
         return replace(parts, clock=replace(self.clock, t_end=parts.t_end))

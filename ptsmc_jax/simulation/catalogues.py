@@ -14,7 +14,7 @@ class Entry(NamedTuple):
 
     unit: str
     meaning: str
-    table: str | None = None  # table of the scenario that a run needs to have the metric; None: every run has it
+    table: str | None = None  # only runs with this table in the scenario have the metric; None: all runs
 
 
 # pointing error indices (ECSS-E-ST-60-10C), see `pointing`; each metric is the largest value in the observation
@@ -30,9 +30,9 @@ INDICES = {
 AXES = {"x": "about x", "y": "about y", "z": "about z", "boresight": "half-cone of the boresight"}
 # indices that a requirement may limit in a fraction of the time
 TIME_FRACTION_INDICES = ("ape", "mpe", "rpe", "ake", "mke", "rke")
-RELATIVE_INDICES = ("rpe", "rke")  # indices that need the stored samples of a window
+RELATIVE_INDICES = ("rpe", "rke")  # errors relative to the mean of their window, whose samples must be stored
 TIME_FRACTION_METRICS = tuple(f"{index}_{axis}" for index in TIME_FRACTION_INDICES for axis in AXES)
-WITHIN = "within_"  # prefix of the metric that is the fraction of the time within the limit of another metric
+WITHIN = "within_"  # within_NAME is the fraction of the time in which the metric NAME is within its limit
 # prefixes of the knowledge errors, which are metrics of runs with measurement noise only
 KNOWLEDGE = tuple(f"{prefix}{index}" for prefix in ("", WITHIN) for index in ("ake", "mke", "rke"))
 

@@ -46,7 +46,7 @@ class Anchored:
     period: Leaf  # h [s]
     t_end: Leaf  # [s]
     before: int = field(metadata={"static": True})  # number of samples before the hand-over, at least t_s / period
-    after: int = field(metadata={"static": True})  # number of samples from the hand-over on
+    after: int = field(metadata={"static": True})  # number of samples at and after the hand-over
     sampled: ClassVar[bool] = True
     anchored: ClassVar[bool] = True
 
@@ -55,9 +55,9 @@ class Anchored:
         """The number of samples."""
         return self.before + self.after
 
-    def long_enough_for(self, others: Sequence[Any]) -> "Anchored":
-        """Return the clock with as many samples before and after the hand-over as the longest of these clocks."""
-        return replace(self, before=max(clock.before for clock in others), after=max(clock.after for clock in others))
+    def long_enough_for(self, clocks: Sequence[Any]) -> "Anchored":
+        """Return this clock with as many samples before and after the hand-over as the longest of several clocks."""
+        return replace(self, before=max(clock.before for clock in clocks), after=max(clock.after for clock in clocks))
 
     def ticks(self, t_f: Scalar, delta: Scalar) -> Ticks:
         """Control periods for this prescribed time and delta [s]."""
@@ -83,13 +83,13 @@ class Flight:
 
     period: Leaf  # h [s]
     t_end: Leaf  # [s]
-    count: int = field(metadata={"static": True})  # samples, at least t_end / period
+    count: int = field(metadata={"static": True})  # number of samples, at least t_end / period
     sampled: ClassVar[bool] = True
     anchored: ClassVar[bool] = False
 
-    def long_enough_for(self, others: Sequence[Any]) -> "Flight":
-        """Return the clock with as many samples as the longest of these clocks."""
-        return replace(self, count=max(clock.count for clock in others))
+    def long_enough_for(self, clocks: Sequence[Any]) -> "Flight":
+        """Return this clock with as many samples as the longest of several clocks."""
+        return replace(self, count=max(clock.count for clock in clocks))
 
     def ticks(self, t_f: Scalar, delta: Scalar) -> Ticks:
         """Control periods for this prescribed time and delta [s]."""
@@ -109,11 +109,11 @@ class Graded:
     """
 
     t_end: Leaf  # [s]
-    window: Leaf  # [s]
+    window: Leaf  # length of the window after t_f [s]
     max_step: Leaf  # largest step [s]
-    saves: Leaf  # (m,) further nodes [s]
-    before: int = field(metadata={"static": True})  # steps before the hand-over at t_s; more than t_s / max_step
-    after: int = field(metadata={"static": True})  # steps after the hand-over
+    saves: Leaf  # (m,) times at which the grid needs a node [s]
+    before: int = field(metadata={"static": True})  # number of steps before the hand-over; more than t_s / max_step
+    after: int = field(metadata={"static": True})  # number of steps after the hand-over
     sampled: ClassVar[bool] = False
     anchored: ClassVar[bool] = False
 
@@ -122,8 +122,8 @@ class Graded:
         """The number of steps."""
         return self.before + self.after
 
-    def long_enough_for(self, others: Sequence[Any]) -> "Graded":
-        """Return the clock unchanged, because its accuracy determines its number of steps."""
+    def long_enough_for(self, clocks: Sequence[Any]) -> "Graded":
+        """Return this clock unchanged: its accuracy determines its number of steps, not the longest of the clocks."""
         return self
 
     def ticks(self, t_f: Scalar, delta: Scalar) -> Ticks:
@@ -150,7 +150,10 @@ class Graded:
         return self._grading_weight(t_f, delta, xp) < 1.0 / LARGEST_STEP_FRACTION
 
     def _grading_weight(self, t_f: Any, delta: Any, xp: Any = jnp) -> Any:
-        """Return the weight a of ln(tau): without `max_step`, the number of steps in which tau falls to 1/e."""
+        """Return the weight a in a ln(tau) + tau / max_step, by which nodes are spaced before the hand-over.
+
+        If `max_step` is infinite, tau = t_f - t falls to 1/e in a steps.
+        """
         return (self.before - (t_f - delta) / self.max_step) / xp.log(t_f / delta)
 
     def _nodes_before_hand_over(self, t_f: Scalar, delta: Scalar) -> Float[Array, " nodes"]:

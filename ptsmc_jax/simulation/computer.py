@@ -24,7 +24,7 @@ class Computer(NamedTuple):
     observer: Any  # memory of the observer
     law: Any  # memory of the law; None: the law has no memory
     # mean torque [N m] and wheel momentum [N m s] of the last period, as the flight software assumes them
-    applied: tuple[Array, Array | None] | None  # None: see `control_period.State`
+    applied: tuple[Array, Array | None] | None  # None: the actuators hold `control_period.State.torque` exactly
     command_filter: Any = None  # memory of the command filter; None: there is no filter
 
 
@@ -32,9 +32,9 @@ class Decision(NamedTuple):
     """The output of a flight computer at a sample."""
 
     target: Any  # reference at the sample
-    d_hat: Array  # (m,) [N m]
+    d_hat: Array  # (m,) estimated disturbance [N m]
     u: Array  # (m,) commanded torque, after the command filter [N m]
-    s: Array  # sliding variable
+    s: Array  # sliding variable of the law at the sample
     w: Any = None  # (m,) measured velocity [rad/s]; None in the continuous loop and in the row at t_end
     channels: Array | None = None  # (channels,) torque, if the flight software itself limits and allocates it [N m]
 
@@ -44,7 +44,7 @@ class Period(NamedTuple):
 
     now: Ticks
     dt_before: Scalar  # length of the period before [s]
-    matrix: Array  # `Observer.update_matrix` of that length
+    matrix: Array  # `Observer.update_matrix` of the length `dt_before`
     full_length: Scalar  # length of a complete period [s]
 
     @property
@@ -54,7 +54,7 @@ class Period(NamedTuple):
 
     @property
     def assumed_length(self) -> Scalar:
-        """The length that the flight software assumes [s]. It does not know that the run ends in its last period."""
+        """The length [s] that the flight software assumes. It does not know that t_end cuts the last period."""
         expected = jnp.where(self.now.partial, self.length, self.full_length)
         return jnp.where(self.length > 0.0, expected, 0.0)
 

@@ -141,7 +141,7 @@ def control_period(vehicle: Vehicle, state: State, tick: Tick) -> tuple[State, R
     )
     if next_offset is not None:
         decision = decision._replace(target=parts.reference(now.t))
-    x_at = motion._replace(rolled=True).state_at  # called once in a run
+    x_at = motion._replace(rolled=True).state_at  # called only once in a run, so that speed does not matter
     return after, Record(now, decision, torques, x_at, dt / parts.substeps, drive)
 
 
@@ -200,18 +200,19 @@ class PeriodMotion(NamedTuple):
     x: Any  # true state then
     drive: Drive
     walk: Array | None  # additional disturbance, constant over the period, (m,) [N m]; None: there is none
-    rolled: bool = False  # integrate by a loop over the stages, which is slower but compiles faster
+    rolled: bool = False  # whether a loop computes the RK4 stages, which is slower but compiles faster
 
     def state_at(self, time: Scalar) -> Any:
         """Return the state at a time [s] in the period."""
         return self.state_after(time - self.t)
 
     def state_after(self, dt: Scalar) -> Any:
-        """Return the state dt [s] into the period."""
+        """Return the true state at dt [s] after the start of the period."""
         parts, drive, walk, actuators = self.parts, self.drive, self.walk, self.parts.actuators
         step = dt / parts.substeps
 
         def substep(k: Scalar, x: Any) -> Any:
+            """Return the state after integration step k, which begins in the state x."""
             start, applied = self.t + k * step, actuators.torque_over(drive, k * step, step)
 
             def rate(time: Scalar, x_stage: Any) -> Any:

@@ -17,12 +17,8 @@ from ptsmc_jax.simulation.assembly import Parts, check_parts
 
 OBSERVER_GAIN, AXIS = "observer_gain", "observer_gain_"
 BANDWIDTH, T_F = "sensors.filter.bandwidth", "controller.t_f"  # each of these gains changes several fields of the parts
-LISTED_LAST = (
-    "k1",
-    "sign_width",
-    "surface_rate",
-    "t_f",
-)  # gains of the law that reports list after the observer's gains
+# reports list these gains of the law after the gains of the observer, its other gains before them
+LISTED_LAST = ("k1", "sign_width", "surface_rate", "t_f")
 REBUILD_ADVICE = "build the parts for them, with ptsmc_jax.replace or with the argument reach of scenario.study"
 
 
@@ -92,7 +88,7 @@ def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
         if name not in gain_paths:
             raise ValueError(f"{name} is no gain of these parts; allowed are {', '.join(sorted(gain_paths))}")
     numbers = {name: _convert_gain(name, value) for name, value in gains.items()}
-    for name, path in gain_paths.items():  # single axes come last, so that they override the gain of all axes
+    for name, path in gain_paths.items():  # gains of single axes are last, so that they override the gain of all axes
         if name in numbers:
             parts = _with_gain_at(parts, path, numbers[name])
     _check_clock(parts)

@@ -68,16 +68,17 @@ class Torques(NamedTuple):
 class Interval(NamedTuple):
     """A control period, or a step of the continuous loop."""
 
-    t: Array  # [s]
-    t_next: Array  # [s]
-    start: Snapshot
-    end: Snapshot
-    errors: Callable[[], Errors]  # called only from t_f on
-    middle_angle: Callable[[], Array]  # angle in the middle, from the cubic of the error [rad]; called only from t_f on
-    arrival: Callable[[], Arrival]  # called only in the interval that contains t_f
+    t: Array  # start [s]
+    t_next: Array  # end [s]
+    start: Snapshot  # true state at the start
+    end: Snapshot  # true state at the end
+    errors: Callable[[], Errors]  # called only for intervals that end at t_f or later
+    # angle in the middle [rad], from the cubic Hermite polynomial of the error; called like `errors`
+    middle_angle: Callable[[], Array]
+    arrival: Callable[[], Arrival]  # called only for the interval that contains t_f
     last_torque: Array  # (m,) torque delivered at the end of the previous interval [N m]
     torques: Torques
-    attitude_error: Callable[[], ErrorPath] | None = None  # None: pointing is not observed
+    attitude_error: Callable[[], ErrorPath] | None = None  # pointing error; None: the run has no pointing metrics
     # error of the attitude that is measured at the start; None: the law gets the true attitude
     knowledge_error: Callable[[], ConstantPath] | None = None
 

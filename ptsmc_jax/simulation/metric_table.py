@@ -51,7 +51,7 @@ class Metric:
     unit: str
     meaning: str
     of_states: tuple[str, str] | None = None  # unit and meaning for chains and systems; None: only for spacecraft
-    table: str | None = None  # table of the scenario that a run needs to have the metric; None: every run has it
+    table: str | None = None  # only runs with this table in the scenario have the metric; None: all runs
     init: Callable[[Start, Criteria], Any] = _zero  # returns None if the run lacks the metric
     update: Callable[[Any, Interval, Criteria], Any] | None = None
     update_after_t_f: Callable[[Any, Interval, Errors, Criteria], Any] | None = None
@@ -131,7 +131,7 @@ def _add_effort(memory: Array, interval: Interval, criteria: Criteria) -> Array:
 
 
 def _is_unsettled(snapshot: Snapshot, criteria: Criteria) -> Array:
-    return ~(snapshot.angle < criteria.settling_angle)  # also if the angle is NaN
+    return ~(snapshot.angle < criteria.settling_angle)  # true if the angle is NaN
 
 
 def _update_settling_time(memory: Array, interval: Interval, criteria: Criteria) -> Array:

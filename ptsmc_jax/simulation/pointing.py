@@ -25,8 +25,9 @@ from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 
 Vector = Float[Array, "3"]
 
-# Directions across the boresight, over half a turn, onto which an error is projected. The largest projection is at most
-# 1/cos(pi/32) - 1 = 0.5 % smaller than the half-cone, and is enlarged by this factor.
+# The half-cone error is computed from projections of the error onto this number of directions across the boresight,
+# which cover half a turn. The half-cone error is at most 1/cos(pi/32) - 1 = 0.5 % larger than the largest projection,
+# which is enlarged by this factor.
 DIRECTIONS = 16
 DIRECTION_ANGLES = np.pi * np.arange(DIRECTIONS) / DIRECTIONS
 
@@ -41,7 +42,8 @@ class Pointing:
     window: Leaf  # length D of a window [s]
     # limits [rad] by metric, for requirements on the fraction of the time within a limit
     limits: dict[str, Leaf] = field(default_factory=dict)
-    samples: int = field(default=0, metadata={"static": True})  # largest number in a window; 0: all samples of the run
+    # largest number of control samples in a window; 0: all samples of the run
+    samples: int = field(default=0, metadata={"static": True})
 
     def for_run(self, steps: int) -> "Pointing":
         """Return the observation for a run with this number of steps."""
@@ -71,7 +73,7 @@ def attitude_error(q: Float[Array, "4"], target: Float[Array, "4"], frame: Float
     Args:
         q: quaternion of the attitude.
         target: quaternion of the reference.
-        frame: see `Pointing`.
+        frame: boresight and two directions across it, (3, 3), see `boresight_frame`.
 
     Returns:
         (5,) The last two entries are the angle of the boresight error times its direction across the boresight.
@@ -102,14 +104,14 @@ class ErrorPath(NamedTuple):
     rise: Array
     a: Array
     b: Array
-    length: Scalar  # length of the interval [s]
+    length: Scalar  # length of the interval of time that the path covers [s]
 
     def error_at(self, x: Scalar) -> Array:
         """Return the error at the fraction x of the interval."""
         return self.start + x * self.rise + x * (1.0 - x) * ((1.0 - x) * self.a + x * self.b)
 
     def integral(self, x: Scalar) -> Array:
-        """Return the integral of the error from the start to the fraction x of the interval [rad s]."""
+        """Return the time integral of the error from the start to the fraction x of the interval [rad s]."""
         square = x * x
         first = square * (0.5 - x * (2.0 / 3.0 - x / 4.0))
         second = square * x * (1.0 / 3.0 - x / 4.0)
@@ -120,14 +122,14 @@ class ConstantPath(NamedTuple):
     """An `attitude_error` (5,) that is constant over an interval."""
 
     end: Array  # [rad]
-    length: Scalar  # length of the interval [s]
+    length: Scalar  # length of the interval of time that the path covers [s]
 
     def error_at(self, x: Scalar) -> Array:
         """Return the error."""
         return self.end
 
     def integral(self, x: Scalar) -> Array:
-        """Return the integral of the error from the start to the fraction x of the interval [rad s]."""
+        """Return the time integral of the error from the start to the fraction x of the interval [rad s]."""
         return self.length * (x * self.end)
 
 
@@ -140,11 +142,11 @@ def hermite_path(start: Array, start_rate: Array, end: Array, end_rate: Array, l
 def error_path(start: tuple, end: tuple, frame: Float[Array, "3 3"], length: Scalar) -> ErrorPath:
     """Return the path of the attitude error between two pairs (state, target), over an interval of a length [s]."""
 
-    def with_rate(x: Any, target: Any) -> tuple[Array, Array]:
+    def error_and_rate(x: Any, target: Any) -> tuple[Array, Array]:
         rates = attitude.derivative(x.q, x.w), attitude.derivative(target.q, target.w)
         return jax.jvp(lambda q, target: attitude_error(q, target, frame), (x.q, target.q), rates)
 
-    return hermite_path(*with_rate(*start), *with_rate(*end), length)
+    return hermite_path(*error_and_rate(*start), *error_and_rate(*end), length)
 
 
 def constant_path(
@@ -218,7 +220,7 @@ def begin(zero: Scalar, segments: int = 0) -> Tally:
 
     Args:
         zero: a zero with the type of the numbers of the run.
-        segments: see `Pointing.segment_count`.
+        segments: number of segments of a window to store, see `Pointing.segment_count`; 0: none.
     """
     zeros, projections = jnp.zeros(4) + zero, jnp.zeros(3 + DIRECTIONS) + zero
     buffer = (
@@ -257,7 +259,7 @@ def update(
     is_observed = t_next > observation_start + tolerance
     is_window_complete = is_observed & (window_end <= t_next + tolerance)
     first_error, last_error = error.error_at(start_fraction), error.error_at(end_fraction)
-    # the start of the observation counts; later intervals begin at the end of the one before
+    # the first interval adds the error at the start of the observation; later ones start where the last one ended
     is_first = t <= observation_start + guards.time_tolerance(window, t)
     window_before = guards.select(is_first, tally.window.with_error(first_error), tally.window)
     largest = jnp.where(is_first, jnp.maximum(tally.largest, _sizes(first_error)), tally.largest)
@@ -267,13 +269,14 @@ def update(
         segments = segments.with_segment(first_error, last_error, length * (end_fraction - start_fraction))
     present_window = window_before._replace(integral=integral, segments=segments).with_error(last_error)
     first_sizes, end_sizes = _sizes(first_error), _sizes(error.end)
-    without_closing = tally._replace(
+    window_open = tally._replace(
         largest=jnp.maximum(largest, end_sizes),
         window=present_window,
         beyond=tally.beyond + length * (1.0 - start_fraction) * _fraction_beyond(first_sizes, end_sizes, limits[0]),
     )
 
     def close_window() -> Tally:
+        """Return the accumulator with the indices of the completed window, and the rest of the interval in the next."""
         mean = present_window.integral / window
         means = _projections(mean)
         deviations = jnp.maximum(present_window.high - means, means - present_window.low)
@@ -288,18 +291,18 @@ def update(
             continues = t_next > window_end + tolerance
             high, low = jnp.where(continues, next_window.high, -jnp.inf), jnp.where(continues, next_window.low, jnp.inf)
             next_window = next_window._replace(high=high, low=low)
-        return without_closing._replace(
-            mean=jnp.maximum(without_closing.mean, _sizes(mean)),
-            relative=jnp.maximum(without_closing.relative, _sizes_from_projections(deviations)),
+        return window_open._replace(
+            mean=jnp.maximum(window_open.mean, _sizes(mean)),
+            relative=jnp.maximum(window_open.relative, _sizes_from_projections(deviations)),
             window=next_window,
-            means_high=jnp.maximum(without_closing.means_high, means),
-            means_low=jnp.minimum(without_closing.means_low, means),
-            windows=without_closing.windows + 1.0,
-            means_beyond=without_closing.means_beyond + jnp.where(_sizes(mean) <= limits[1], 0.0, window),
-            relative_beyond=without_closing.relative_beyond + beyond,
+            means_high=jnp.maximum(window_open.means_high, means),
+            means_low=jnp.minimum(window_open.means_low, means),
+            windows=window_open.windows + 1.0,
+            means_beyond=window_open.means_beyond + jnp.where(_sizes(mean) <= limits[1], 0.0, window),
+            relative_beyond=window_open.relative_beyond + beyond,
         )
 
-    after = jax.lax.cond(is_window_complete, close_window, lambda: without_closing)
+    after = jax.lax.cond(is_window_complete, close_window, lambda: window_open)
     return guards.select(is_observed, after, tally)
 
 

@@ -11,7 +11,8 @@ from ptsmc_jax.simulation.catalogues import AXES, WITHIN
 from ptsmc_jax.simulation.interval import Criteria, Interval
 from ptsmc_jax.simulation.pointing import ConstantPath, ErrorPath, Pointing, Tally
 
-ATTITUDE, KNOWLEDGE = ("ape", "mpe", "rpe"), ("ake", "mke", "rke")  # absolute, mean, relative
+# absolute, mean and relative error of the true attitude, and of the measured attitude
+ATTITUDE, KNOWLEDGE = ("ape", "mpe", "rpe"), ("ake", "mke", "rke")
 
 
 class PointingErrors(NamedTuple):

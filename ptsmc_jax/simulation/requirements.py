@@ -83,11 +83,11 @@ class Verdict:
     trials: int
     quantile: float | None = None  # fraction of trials that must keep the limit; None: all of them
     confidence: float | None = None  # confidence that the fraction of all possible trials is at least the quantile
-    at_least: bool = False  # whether the limit is the smallest allowed value
+    at_least: bool = False  # whether the limit is the smallest allowed value; otherwise the largest
     interpretation: str = "ensemble"
     # fraction of the time within the limit: the smallest of all runs, or, mixed, the mean over the runs
     fraction_of_time: float | None = None
-    shown: float | None = None  # lower bound of `fraction_of_time` with the confidence
+    shown: float | None = None  # lower bound on `fraction_of_time` at the confidence level `confidence`
 
     @property
     def met(self) -> bool:

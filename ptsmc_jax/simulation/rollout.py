@@ -84,8 +84,8 @@ def simulate(
     x0 = jax.tree.map(lambda v: jnp.asarray(v, float), parts.aligned_initial)
     unit = parts.controller.kinematics.singularity_distance_unit(parts.controller.singularity_distance(x0, target))
     target_t_f = parts.reference(criteria.t_f)
-    unit, gap = jax.lax.stop_gradient(unit), _first_uncovered_time(parts, ticks)
-    run = Run(parts, ticks, criteria, x0, target, target_t_f, unit, gap, record)
+    unit, uncovered_from = jax.lax.stop_gradient(unit), _first_uncovered_time(parts, ticks)
+    run = Run(parts, ticks, criteria, x0, target, target_t_f, unit, uncovered_from, record)
     return sampled.simulate(run, seed, trial, software) if parts.clock.sampled else continuous.simulate(run)
 
 
@@ -132,7 +132,7 @@ def _check_shape(name: str, value: Any, allowed: list[tuple[int, ...]]) -> None:
 
 
 def _first_time_without_samples(ticks: Ticks, t_end: Scalar) -> Scalar:
-    """Return the first time without samples [s], or NaN. A clock built for a shorter t_f or delta has too few."""
+    """Return the first time without samples [s], or NaN. A clock made for a shorter t_f or delta lacks samples."""
     first, last = ticks.t[0], ticks.t_next[-1]
     end_of_samples = jnp.where(last < t_end - guards.time_tolerance(t_end, t_end), last, jnp.nan)
     return jax.lax.stop_gradient(jnp.where(first > 0.0, 0.0, end_of_samples))
@@ -141,9 +141,10 @@ def _first_time_without_samples(ticks: Ticks, t_end: Scalar) -> Scalar:
 def _first_uncovered_time(parts: Parts, ticks: Ticks) -> Scalar:
     """Return the first time that the clock does not cover [s], or NaN; 0 if continuous steps are too coarse."""
     clock: Any = parts.clock
-    gap = _first_time_without_samples(ticks, parts.t_end)
-    law = parts.controller
-    return gap if clock.sampled else jnp.where(clock.is_too_coarse(law.t_f, law.delta), 0.0, gap)
+    without_samples = _first_time_without_samples(ticks, parts.t_end)
+    if clock.sampled:
+        return without_samples
+    return jnp.where(clock.is_too_coarse(parts.controller.t_f, parts.controller.delta), 0.0, without_samples)
 
 
 class _SimulateProgram(programs.Program):
@@ -158,9 +159,9 @@ class _SimulateProgram(programs.Program):
         return super().__call__(*args, **kwargs)
 
 
-# one compiled program for all parts of the same structure
+# compiled `simulate`; one program serves all parts that differ in numbers only
 simulate_parts = _SimulateProgram(simulate, ("record", "software"), title="the simulation")
-# the same function for a single run: compiles 2 to 10 times as fast, and runs 3 to 8 times as slowly
+# `simulate` for a single run: it compiles 2 to 10 times as fast, and runs 3 to 8 times as slowly
 simulate_once = _SimulateProgram(simulate, ("record", "software"), programs.FAST_COMPILE, title="the simulation")
 LONG_RUN = 20_000  # number of control periods above which the slower compilation of `simulate_parts` pays off
 

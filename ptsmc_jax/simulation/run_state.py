@@ -80,17 +80,17 @@ class Run(NamedTuple):
     target_0: Any  # reference at t = 0
     target_t_f: Any  # reference at t_f
     singularity_distance_unit: Array  # divisor of the distance to the law's singularity, see `Kinematics`
-    gap: Array  # first time that the clock has no samples for [s]; NaN: there are samples from t = 0 to t_end
+    uncovered_from: Array  # first time for which the clock has no samples [s]; NaN: it covers t = 0 to t_end
     record: bool  # whether the history is recorded
 
 
 class Score(NamedTuple):
     """Metrics and status of a run so far."""
 
-    snapshot: Snapshot
-    running: metrics.Running
-    status: Array
-    bad_time: Array
+    snapshot: Snapshot  # true state at the present time
+    running: metrics.Running  # accumulators of the metrics
+    status: Array  # code of the first failure, see `STATUS`
+    bad_time: Array  # time of the first failure [s]; NaN: none
 
 
 def begin(run: Run) -> Score:
@@ -176,7 +176,7 @@ def history_row_at(
         x: true state.
         decision: decision of the flight software.
         u: delivered torque, (m,) [N m].
-        has_length: see `Log`.
+        has_length: whether the interval of the row has a positive length, or the row is the last.
         walk: random walk of the disturbance, (m,) [N m], or None.
         wheels: momentum [N m s] and torque [N m] of the reaction wheels, or None.
     """
@@ -199,7 +199,7 @@ def finish(run: Run, initial: Score, score: Score, log: Log | None, samples: dic
         initial: metrics and status at t = 0.
         score: metrics and status at t_end.
         log: history, or None.
-        samples: see `Result`.
+        samples: number of samples by the status that exported C reports, or None.
     """
     criteria, angle_at_t_f = run.criteria, score.running.arrival.angle
     values = metrics.finish(score.running, criteria)
@@ -207,11 +207,12 @@ def finish(run: Run, initial: Score, score: Score, log: Log | None, samples: dic
     not_converged = (score.status == OK) & is_not_converged(
         angle_at_t_f, initial.snapshot.angle, criteria.settling_angle
     )
-    is_incomplete = ~jnp.isnan(run.gap) & ~(score.bad_time < run.gap)  # a status after the gap has no meaning
+    # a run that the clock does not cover is incomplete, unless it failed while it was covered
+    is_incomplete = ~jnp.isnan(run.uncovered_from) & ~(score.bad_time < run.uncovered_from)
     status = jnp.where(unbounded, UNBOUNDED, jnp.where(not_converged, NOT_CONVERGED, score.status))
     status = jnp.where(is_incomplete, INCOMPLETE, status).astype(jnp.int32)
     bad_time = jnp.where(unbounded, criteria.t_end, jnp.where(not_converged, criteria.t_f, score.bad_time))
-    bad_time = jnp.where(is_incomplete, run.gap, bad_time)
+    bad_time = jnp.where(is_incomplete, run.uncovered_from, bad_time)
     return Result(values, status, bad_time, log, samples or {})
 
 

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 CAMPAIGN_SEED = 1000  # differs from the default seed of a search, whose trials must not verify its gains
 MOST_TRIALS = 2**32  # trial numbers have 32 bits
 
-HELP = Group.create_default_parameters()  # its options appear in the help
-# options of a group exclude each other
+HELP = Group.create_default_parameters()  # options of this group appear in the help
+# options of the same group exclude each other
 TRIALS, STOPPING, PARTS, WHERE = (Group(show=False, validator=MutuallyExclusive()) for _ in range(4))
 
 CampaignFolder = Annotated[Path, Parameter(name="DIR", help="Folder of `ptsmc montecarlo`.")]
@@ -214,7 +214,7 @@ def _simulate_shard(
     workers: "Cluster | None",
     width: float | None,
 ) -> "Folder":
-    """Simulate a shard of a campaign; width: see --until-confident."""
+    """Simulate a shard of a campaign; width: value of --until-confident, or None."""
     from tuning.studies import campaign_folder, campaign_theory
 
     campaign_theory.prepare(folder)
@@ -340,7 +340,7 @@ def replay(
 
 
 def _configure_jax(folder: Path) -> None:
-    """Configure JAX with the precision of the campaign."""
+    """Configure JAX with the precision that the campaign in a folder was simulated with."""
     from ptsmc_jax.campaigns import store
     from ptsmc_jax.configure import configure
 

@@ -44,7 +44,7 @@ app = App(
     suppress_keyboard_interrupt=False,
 )
 
-LONG = 20_000  # integration steps of a run that takes several seconds
+LONG = 20_000  # number of integration steps above which a run takes several seconds
 
 
 @app.command
@@ -357,7 +357,7 @@ def main() -> None:
     except ValueError as error:
         _fail(str(error) if _is_configuration_error(error) else _describe_custom_code_error(error))
     except OSError as error:
-        name = error.filename2 or error.filename  # the target of a move; unknown if the disk is full
+        name = error.filename2 or error.filename  # for a move, filename2 is its target; None if the disk is full
         _fail(f"{error.strerror or error}{'' if name is None else f': {name}'}")
     except (Exception, SystemExit) as error:  # custom code may exit
         _fail(_describe_custom_code_error(error))

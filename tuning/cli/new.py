@@ -17,7 +17,7 @@ from ptsmc_jax.scenario.values import Table
 from ptsmc_jax.simulation import catalogues
 from tuning.errors import UsageError
 
-COLUMN, WIDTH = 36, 120  # first column of the meanings, and length of the lines
+COLUMN, WIDTH = 36, 120  # column in which meanings begin, and largest length of a line
 # Example values of keys without a default.
 EXAMPLES: dict[str, Any] = {
     "plant.system": "my_plant.py:my_plant",
@@ -102,7 +102,7 @@ class _ScenarioFile:
         self.values["tune"] = {**default, **self.values.get("tune", {})}
 
     def lines(self) -> Iterator[str]:
-        """Return all lines."""
+        """Return all lines of the file."""
         yield from _comment_lines(INTRODUCTION)
         for name, table in layouts.TABLES[self.plant].items():
             if name == "tune":
@@ -110,7 +110,7 @@ class _ScenarioFile:
             yield from ("", *(self.dispersion_lines() if name == "dispersion" else self.table_lines(name, table)))
 
     def table_lines(self, name: str, table: type[Table] | layouts.Kinds) -> Iterator[str]:
-        """Return the lines of a table, followed by the keys of its other kinds."""
+        """Return the lines of a table, followed by the keys of its other kinds as comments."""
         stated, values = self.stated_tables.get(name), self.values.get(name, {})
         kinds = table if isinstance(table, Mapping) else {}
         kind = self.plant if name == "plant" else values.get("kind", next(iter(kinds), None))
@@ -145,18 +145,19 @@ class _ScenarioFile:
         if kind is not None:
             yield from _key_lines(stated is None, "kind", kind, keys.description(struct))
         values = {**self.default_values(name, struct), **values}
-        borrowed = Attitude.__struct_fields__ if name != "initial" else ()  # the file explains them at [initial]
+        # the attitude keys are explained at [initial] only; other tables show those that the scenario has
+        explained_before = Attitude.__struct_fields__ if name != "initial" else ()
         for key in keys.list_keys(struct, self.resolved.unit_of_d):
             is_off = stated is None or key.name not in stated
             kinds = layouts.KINDS.get(f"{name}.{key.name}")
             if kinds is not None:
                 yield from self.inline_lines(name, key, (stated or {}).get(key.name, {}), kinds)
-            elif not (is_off and key.name in borrowed):
+            elif not (is_off and key.name in explained_before):
                 value = values[key.name] if key.name in values else self.example_value(name, kind, key)
                 yield from _key_lines(is_off, key.name, value, _describe_key(key))
 
     def dispersion_lines(self) -> Iterator[str]:
-        """Return a line for each kind of each dispersion."""
+        """Return the lines of [dispersion], one for each kind of each dispersion; unused kinds are comments."""
         struct, stated = layouts.TABLES[self.plant]["dispersion"], self.stated_tables.get("dispersion")
         assert isinstance(struct, type)
         yield from _comment_lines(keys.description(struct))
@@ -166,7 +167,7 @@ class _ScenarioFile:
             yield from self.inline_lines("dispersion", key, chosen, layouts.DISPERSIONS[key.name])
 
     def inline_lines(self, name: str, key: keys.Key, chosen: Mapping[str, Any], kinds: layouts.Kinds) -> Iterator[str]:
-        """Return a line for each kind of an inline table.
+        """Return a line for each kind of an inline table; all but the kind in the scenario are comments.
 
         Args:
             name: name of the table that contains the inline table.
@@ -245,6 +246,7 @@ def scenario_text(plant: str | None, raw: Mapping[str, Any]) -> str:
 
 
 def _describe_key(key: keys.Key) -> str:
+    """Return the meaning of a key, after its allowed values if they are texts."""
     choice = f"{key.allowed.replace(' or ', ' | ')}: " if key.allowed.startswith('"') and " or " in key.allowed else ""
     return choice + key.text
 
@@ -259,4 +261,5 @@ def _key_lines(off: bool, key: str, value: Any, meaning: str) -> Iterator[str]:
 
 
 def _comment_lines(words: str) -> list[str]:
+    """Return a text as comments of the scenario file, wrapped to its width."""
     return [f"# {line}" for line in textwrap.wrap(words, WIDTH - 2)]

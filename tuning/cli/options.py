@@ -51,7 +51,7 @@ Trust = Annotated[
 ]
 
 
-@Parameter(name="*")  # its fields are options
+@Parameter(name="*")  # each field of the class is an option of the command
 @dataclass(frozen=True)
 class Common:
     """The options of every command that runs code of the user and writes a result folder."""
