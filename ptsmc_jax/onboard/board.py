@@ -79,7 +79,7 @@ class Board:
         return tuple(f"{prefix}.{name}" for name in self.model.signals)
 
     def measured_state(self, values: Values, prefix: str) -> State:
-        """Return the measured state from values by these names."""
+        """Return the measured state, whose signals are in `values` under the names of `signal_names`."""
         return self.model.state_of({name: values[f"{prefix}.{name}"] for name in self.model.signals})
 
     @property
@@ -112,7 +112,7 @@ def real(*shape: int) -> jax.ShapeDtypeStruct:
 
 
 def flag() -> jax.ShapeDtypeStruct:
-    """Return shape and dtype of a flag."""
+    """Return shape and dtype of a flag, an integer that is 0 or 1."""
     return jax.ShapeDtypeStruct((), jnp.int32)
 
 

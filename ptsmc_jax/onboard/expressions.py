@@ -52,7 +52,7 @@ class Node:
         if self.op == "constant":
             return math.isfinite(self.value)
         if self.op == "place":
-            return not self.value.startswith("d->")  # derived numbers may overflow
+            return not self.value.startswith("d->")  # numbers that C derives from parameters may overflow
         keeps_finite = self.op in FINITE_OPERATIONS or (self.op == "convert" and self.args[0].kind != REAL)
         return keeps_finite and all(arg.finite for arg in self.args)
 
@@ -86,8 +86,9 @@ class Region:
         self.initial: list[Node] = []  # initial values of a loop's state
         self.length = 0  # number of passes of a counted loop
         self.index: Node | None = None  # index of a counted loop
-        self.tables: list[tuple[Node, list[Node]]] = []  # arrays that a counted loop reads: name, entries
-        self.rows: list[tuple[Node, int]] = []  # arrays that a counted loop fills: name, index of the output
+        # C arrays of a counted loop: those that it reads, with their entries; those that it fills, with output index
+        self.tables: list[tuple[Node, list[Node]]] = []
+        self.rows: list[tuple[Node, int]] = []
 
 
 # functions that evaluate an operation on constants, by operation
@@ -166,6 +167,7 @@ class Pool:
         return block
 
     def _store(self, key: Any, node: Node) -> Node:
+        """Record a new node under its key, so that `Block.find` finds it, and return the node."""
         node.block.nodes_by_key[key] = node
         return node
 
@@ -192,6 +194,7 @@ class Pool:
         return self._store(key, node)
 
     def _simplify(self, op: str, args: Sequence[Node], kind: str) -> Node | None:
+        """Return a simpler node that equals the operation, or None."""
         is_constant = [a.op == "constant" for a in args]
         if all(is_constant) and op in EVALUATORS:
             value = EVALUATORS[op](*(a.value for a in args))

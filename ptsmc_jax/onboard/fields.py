@@ -101,6 +101,7 @@ def declared_meaning(part: Any, name: str) -> str:
 
 
 def _child(tree: Any, entry: Any) -> Any:
+    """Return the part of a pytree at a key or index, or None if there is none."""
     try:
         return tree[entry]
     except (TypeError, KeyError, IndexError):

@@ -72,7 +72,7 @@ class Model(NamedTuple):
     texts: dict[str, str]  # text of each C file, by file name
     t_end: float  # end of the run [s]
     filter_state: Sequence[Field] = ()  # parts of the state that can be set before the first sample
-    plant: bool = False  # whether it is the plant: its samples are at the end of a step, and its parameters are fixed
+    plant: bool = False  # whether the program is the plant: it samples at the end of a step, and parameters are fixed
 
     @property
     def period(self) -> float:

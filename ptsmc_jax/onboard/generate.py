@@ -21,7 +21,8 @@ from ptsmc_jax.onboard.translate import Translator
 Struct = dict[str, list[Field]]  # the fields of each named tree
 POINTERS = {"p": "const ptsmc_params *p", "d": "const ptsmc_derived *d", "in": "const ptsmc_in *in",
             "before": "const ptsmc_state *before", "now": "ptsmc_state *now", "out": "ptsmc_out *out"}  # fmt: skip
-CALL_ARGUMENTS = {"d": "&state->derived", "before": "state", "now": "&now", "out": "&found"}  # arguments in ptsmc_step
+# arguments that ptsmc_step passes to the functions of the stages
+CALL_ARGUMENTS = {"d": "&state->derived", "before": "state", "now": "&now", "out": "&found"}
 SCALAR_PARAMETERS = {"t": "real t", "dt": "real dt", "regular": "int regular", "tracking": "int tracking"}
 # classes whose docstrings are omitted from the comments in C
 COMMON_BASES = (object, Law, AccelerationLaw, Kinematics, AttitudeKinematics, Observer)
@@ -149,8 +150,9 @@ def _add_stage_function(
         prefix, _, key = name.partition(".")
         return structs[STRUCT_OF_PREFIX[prefix]][key]
 
-    def run_stage(leaves: list[Any], read_values: list[Any]) -> dict[str, Any]:
-        return stage.run(params.unflatten(leaves), dict(zip(stage.reads, read_values, strict=True)))
+    def run_stage(parameter_leaves: list[Any], read_values: list[Any]) -> dict[str, Any]:
+        """Return the values that the stage writes, by name, given the values of the names in `stage.reads`."""
+        return stage.run(params.unflatten(parameter_leaves), dict(zip(stage.reads, read_values, strict=True)))
 
     pool, args = Pool(), list[np.ndarray]()
     shapes = [_shape_of(board, name) for name in stage.reads]

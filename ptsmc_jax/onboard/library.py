@@ -31,8 +31,8 @@ from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.computer import PYTHON_SOFTWARE, SAMPLE_STATUSES, Computer, Decision, Period, Software
 
 PARAMETER_TOLERANCE = 1e-6  # smaller differences, relative to the largest element, may be rounding to 32 bits
-MOST_LISTED = 4  # largest number of parameters that a message lists
-_loaded = itertools.count()
+MOST_LISTED = 4  # largest number of different parameters that a message lists
+_loaded = itertools.count()  # number of the next library, for unique names in XLA
 
 
 def compiler() -> list[str]:

@@ -111,7 +111,10 @@ def _replace_parts(parts: Parts, values: Values, traced: Values) -> Parts:
 
 
 def _draw_trial(parts: Parts, dispersion: Dispersion, values: Values) -> Parts:
-    """Apply the dispersions of the trial that the parameters `seed` and `trial` select, and align the initial state."""
+    """Return the parts with the dispersions of one trial, selected by the parameters `seed` and `trial`.
+
+    The sign of the initial quaternion, q or -q, is chosen by `Setup.aligned_initial`.
+    """
     nominal = _replace_parts(parts, values, values)
     if hasattr(nominal.plant, "with_inertia"):  # the inverse and a gravity gradient follow from the inertia
         nominal = nominal.with_inertia(nominal.plant.inertia, known=False)

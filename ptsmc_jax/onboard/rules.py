@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from ptsmc_jax.onboard.expressions import BOOL, REAL, Node, Pool
 
-# functions of `numerics.elementary`, which are arithmetic in XLA, and their names in math.h
+# functions of `numerics.elementary`, which XLA computes by arithmetic and C by these functions of math.h
 KNOWN_FUNCTIONS = {"log": "log", "arctan2": "atan2"}
 
 

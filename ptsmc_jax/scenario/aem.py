@@ -50,7 +50,7 @@ class Block:
 
 
 class Segment(NamedTuple):
-    """Attitudes of a message."""
+    """Attitudes of a segment of a message."""
 
     times: np.ndarray  # (n,) [s], 0 at the start of the run
     quaternions: np.ndarray  # (n, 4) from body to inertial axes, scalar last
@@ -95,7 +95,7 @@ def read_segment(text: str, start_epoch: Epoch | None = None, *, any_interpolati
 
 
 def _split_segments(text: str) -> Iterator[Block]:
-    """Yield the segments of a message."""
+    """Yield the segments of an attitude ephemeris message, each with its keywords and data lines."""
     block, section, has_version = None, "", False
     for number, line in enumerate(text.splitlines(), 1):
         line = line.strip()
@@ -183,8 +183,9 @@ def _parse_data(block: Block) -> tuple[list[Epoch], np.ndarray]:
             raise ValueError(f"line {number}: it has {len(cells)} numbers, but {kind} has {NUMBERS_PER_LINE[kind]}")
         row = [_to_float(cell) for cell in cells]
         if not np.all(np.isfinite(row)):
-            bad = cells[int(np.argmin(np.isfinite(row)))]
-            raise ValueError(f'line {number}, column {cells.index(bad) + 2}: it is "{bad}", but must be a number')
+            invalid = cells[int(np.argmin(np.isfinite(row)))]
+            place = f"line {number}, column {cells.index(invalid) + 2}"
+            raise ValueError(f'{place}: it is "{invalid}", but must be a number')
         rows.append(row)
     return times, np.array(rows).reshape(len(rows), NUMBERS_PER_LINE[kind])
 

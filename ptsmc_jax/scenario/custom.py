@@ -137,7 +137,7 @@ def find_data_tables(file: Mapping[str, Any]) -> list[dict]:
 
 
 def data_files_by_key(scenario: Table) -> dict[str, str]:
-    """Return the paths of the data files that a scenario names, by key."""
+    """Return the paths of the data files that a scenario names, by the key that names the file."""
     file = getattr(getattr(scenario, "reference", None), "file", None)
     return {} if file is None else {DATA_FILE_KEY: file}
 

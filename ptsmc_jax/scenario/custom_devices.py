@@ -48,7 +48,7 @@ def _field_error(part: Any, table: str, field: str, allowed: str) -> ScenarioErr
     return ScenarioError(f"{beginning}, but must be {allowed}")
 
 
-SENSORS: Kinds = {  # those that are built in are keys of [hardware] and [filter]
+SENSORS: Kinds = {  # kinds of the table [sensors]; built-in sensors are set by [hardware] and [filter] instead
     "custom": custom_kind(
         SensorTable, custom_sensors.SampledSensor, ("see",), has_gains=True,
         summary="Custom sensors, a class derived from ptsmc_jax.SampledSensor; its fields are further keys. They "

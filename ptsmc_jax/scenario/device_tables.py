@@ -228,7 +228,7 @@ class Hardware(Actuators, frozen=True):
         return dataclasses.replace(actuators, directions=vector(rotations.apply(axes.T).T))
 
     def noise_of_error(self, scenario: Any) -> tuple[float, float]:
-        """Return half of the star tracker noise [-] and half of the gyro noise [1/s].
+        """Return the noise of the error [-] and of its rate [1/s]: half of the noise of star tracker and gyro.
 
         The error is half an angle. The additive error has at most this noise, depending on the attitude of the
         reference in the inertial frame.

@@ -31,7 +31,7 @@ class Numbers(Table, frozen=True):
     distribution: ClassVar[str] = "normal"  # distribution of `dispersions.numbers.RandomNumbers`
     width_key: ClassVar[str] = "std"  # the key that holds the spread; it is in degrees if its name ends with _deg
     norm_quantile: ClassVar[float] = 4.6  # norm / spread that 1 of 10 000 vectors (3,) exceeds
-    largest_deviation: ClassVar[float] = 3.0  # largest deviation / spread in bounds: three sigma
+    largest_deviation: ClassVar[float] = 3.0  # largest deviation that bounds assume, relative to the spread
 
     def widths(self, count: int = 1) -> np.ndarray:
         """Return the widths of `count` numbers (count,), converted to rad if the key is in degrees.

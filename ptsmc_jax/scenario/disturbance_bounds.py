@@ -30,8 +30,8 @@ PHASE_COUNT = 16  # random phases at which a custom disturbance is evaluated
 class Bounds(NamedTuple):
     """Largest magnitude and rate of each component of a disturbance."""
 
-    size: np.ndarray  # (m,) of d [N m, or unit of d]
-    rate: np.ndarray  # (m,) of d' [the same per second]
+    size: np.ndarray  # (m,) largest magnitude of d [N m, or unit of d]
+    rate: np.ndarray  # (m,) largest magnitude of d' [the same per second]
 
 
 def compute(scenario: Any) -> tuple[float, float] | None:

@@ -62,15 +62,15 @@ def is_observer_time_default(scenario: Scenario) -> bool:
 
 
 def _check_table(scenario: Scenario, tune: tables.Tune) -> None:
-    """Raise ScenarioError for invalid gains, objective or bounds, before default bounds are computed."""
-    free, present = tune.gains, scenario.gains
+    """Raise ScenarioError if gains, objective or stated bounds of [tune] are invalid. Runs before default bounds."""
+    free, scenario_gains = tune.gains, scenario.gains
     if len(set(free)) < len(free):
         raise wrong("tune.free", free, "a list that names each gain once")
-    if not set(free) <= {*tables.TUNABLE_GAINS, *present}:
+    if not set(free) <= {*tables.TUNABLE_GAINS, *scenario_gains}:
         raise wrong("tune.free", free, tables.FREE_ALLOWED)
     beginning = f"tune.free is {errors.brief(free)}, but"
     for name in free:
-        if name not in present:
+        if name not in scenario_gains:
             raise ScenarioError(f"{beginning} {_absence_reason(scenario, name)}")
     if "t_f" in free and is_observer_time_default(scenario):
         raise ScenarioError(f"{beginning} observer.t_o then follows t_f; allowed is t_f with observer.t_o given")
@@ -132,6 +132,7 @@ def _absence_reason(scenario: Scenario, name: str) -> str:
 
 
 def _check_bounds(context: BoundsContext, name: str) -> None:
+    """Raise ScenarioError if the bounds of a gain are not allowed, or if the gain is not free."""
     key, (lower, upper) = f"tune.bounds.{name}", context.bounds[name]
     known_gains = dict.fromkeys((*context.scenario.gains, *tables.TUNABLE_GAINS))
     if name not in known_gains:

@@ -14,7 +14,7 @@ import msgspec
 from ptsmc_jax.declare import Declaration
 from ptsmc_jax.scenario.values import Kinds, Meaning, Table
 
-UNIT_OF_D = "unit of d"  # in docstrings: the unit of the plant's disturbance
+UNIT_OF_D = "unit of d"  # placeholder in declared units: replaced by the unit of the plant's disturbance d, if known
 
 
 class Key(NamedTuple):

@@ -15,7 +15,7 @@ from ptsmc_jax.declare import Scaled
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.values import Table
 
-PAPER_INERTIA = (10.0, 12.0, 14.0)  # of the published spacecraft [kg m^2]
+PAPER_INERTIA = (10.0, 12.0, 14.0)  # principal moments of the published spacecraft [kg m^2]
 PAPER_TIMES = (30.0, 40.0)  # range of t_f in the published cases of a spacecraft [s]
 CHAIN_TIME = 5.0  # t_f of the published integrator chains [s]
 
@@ -110,12 +110,12 @@ class Design(NamedTuple):
     left until t_f. It reaches its value in the hold phase, 2 p, at tau = delta.
     """
 
-    eta: float
-    pole: float  # p [1/s]
-    observer: float  # l [N m s], or l [1/s] without a body
-    width: float  # thickness of the boundary layer, in units of s
-    reaching: float  # K1 / pole, see `Scenario.reaching`
-    time: float  # t_f / published t_f, see `Scales`
+    eta: float  # exponent of the law [-]
+    pole: float  # p, rate of the closed loop in the hold phase [1/s]
+    observer: float  # gain l of the observer [N m s], or [1/s] without a body
+    width: float  # designed thickness of the boundary layer, in units of s
+    reaching: float  # K1 / p: 2 for a spacecraft, otherwise 1
+    time: float  # t_f / published t_f
 
     @property
     def delta(self) -> float:
@@ -170,6 +170,7 @@ def fastest_pole(scenario: Any) -> float:
 
 
 def _design(scenario: Any, pole: float, eta: float, observer: float) -> Design:
+    """Return the design for a pole rate p [1/s], an eta, and an observer rate relative to p."""
     law, period = scenario.controller, scenario.loop.period
     largest_delta = 0.5 * (law.t_f + period)  # [s]
     eta = min(eta, max(0.5 + pole * largest_delta, _smallest_eta(scenario)))
@@ -196,7 +197,7 @@ def _pole_range(scenario: Any) -> _PoleRange:
     """
     t_f, period = scenario.controller.t_f, scenario.loop.period
     slowest, fastest = MIN_POLE_TIMES_T_F / t_f, fastest_pole(scenario)
-    if fastest <= slowest:  # the larger of this limit and the p with delta = t_f / 2
+    if fastest <= slowest:  # use the larger of `fastest` and the p with delta = t_f / 2
         slow_pole = max(fastest, (2.0 * _smallest_eta(scenario) - 1.0) / t_f)
         return _PoleRange(max(fastest, 0.1 * slow_pole), slow_pole, slow_pole)
     position, velocity = scenario.devices.noise_of_error(scenario)

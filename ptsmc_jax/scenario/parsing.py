@@ -83,12 +83,12 @@ def load(path: str | Path) -> dict[str, Any]:
     return raw
 
 
-def parse(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
-    """Return the scenario of raw tables, with defaults that do not depend on other keys.
+def parse(raw: Mapping[str, Any], *, run_code: bool = False) -> Scenario:
+    """Return the scenario of raw tables. Keys whose default depends on other keys are still None.
 
     Args:
         raw: tables by name, as TOML returns them.
-        run: whether custom code may run, which provides its keys.
+        run_code: whether custom code that the tables name may run; its classes then provide further keys.
 
     Raises:
         ScenarioError: a table or key is unknown, or a value is not allowed.
@@ -106,7 +106,7 @@ def parse(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
     for name, table in raw.items():
         if name not in layout and name != "requirements":
             raise _unknown_table_error(name, table, kind)
-    context = Context(scenario_class, run)
+    context = Context(scenario_class, run_code)
     plant = typing.cast(Any, _parse_table("plant", raw.get("plant", {}), layout["plant"], context))
     law_kind = raw.get("controller", {}).get("kind", next(iter(typing.cast(Kinds, layout["controller"]))))
     defaults = scenario_class.plant_defaults(plant, raw.get("plant", {}).keys(), law_kind)

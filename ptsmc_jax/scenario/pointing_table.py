@@ -63,7 +63,7 @@ class Pointing(Table, frozen=True):
             for name, limit in scenario.requirements.items()
             if getattr(limit, "interpretation", None) not in (None, "ensemble")
         }
-        # if no limit needs the samples, their number is 0 for every period, so that one program serves all periods
+        # if no limit needs samples in a window, their number is 0, so that one program serves all control periods
         needs_samples = scenario.sampled and any(name.startswith(catalogues.RELATIVE_INDICES) for name in limits)
         # both ends of a window may be samples, and jitter of half a period may move one more sample into it
         samples = math.ceil(self.window / scenario.loop.period) + 2 if needs_samples else 0

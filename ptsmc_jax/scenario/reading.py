@@ -49,7 +49,7 @@ def from_tables(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
 
 def _validate(raw: Mapping[str, Any], run: bool) -> Scenario:
     """Return the scenario of raw tables, with the defaults that depend on other keys."""
-    scenario = resolve(parsing.parse(raw, run=run))
+    scenario = resolve(parsing.parse(raw, run_code=run))
     checks.check_keys(scenario)
     if scenario.tune is not None and not custom.has_unloaded_code(scenario):
         scenario = msgspec.structs.replace(scenario, tune=free_gains.resolve(scenario, scenario.tune))

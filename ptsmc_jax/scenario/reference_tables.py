@@ -45,7 +45,7 @@ class ReferenceTable(PartTable, frozen=True):
         """Return the part of `signals`."""
         raise NotImplementedError
 
-    def initial_attitude(self, scenario: Any) -> np.ndarray:
+    def initial_reference_attitude(self, scenario: Any) -> np.ndarray:
         """Return the unit quaternion (4,) of the reference at t = 0."""
         raise NotImplementedError
 
@@ -58,12 +58,12 @@ class AttitudeReference(Attitude, ReferenceTable, frozen=True):
         return {f"reference.{self.part_class.paced_by}": fastest_rate(self, "reference", part)}
 
     def check(self, scenario: Any) -> None:
-        self.initial_attitude(scenario)
+        self.initial_reference_attitude(scenario)
 
     def build(self, scenario: Any) -> Any:
-        return self.part(q=vector(self.initial_attitude(scenario)))
+        return self.part(q=vector(self.initial_reference_attitude(scenario)))
 
-    def initial_attitude(self, scenario: Any) -> np.ndarray:
+    def initial_reference_attitude(self, scenario: Any) -> np.ndarray:
         return attitude_keys.quaternion(self, "reference")
 
 
@@ -146,7 +146,7 @@ class FileReference(ReferenceTable, frozen=True):
         samples = self._samples(scenario)
         return attitude_tables.interpolate_attitude(samples.times, samples.quaternions, samples.end_rates)
 
-    def initial_attitude(self, scenario: Any) -> np.ndarray:
+    def initial_reference_attitude(self, scenario: Any) -> np.ndarray:
         self.check(scenario)
         samples = self._samples(scenario)
         k = int(np.argmin(np.abs(samples.times)))  # the nearest sample is accurate enough for a default
@@ -192,7 +192,7 @@ class NadirTable(MissionTable, frozen=True):
         part = self.part_class(q=missions.IDENTITY, mount=self.mount, orbit=self._orbit(scenario))
         return jax.tree.map(vector, part)
 
-    def initial_attitude(self, scenario: Any) -> np.ndarray:
+    def initial_reference_attitude(self, scenario: Any) -> np.ndarray:
         self.check(scenario)
         axes = self._orbit(scenario)(np.zeros(()), np)
         return missions.mounted_quaternion(np.stack([axes.radial, axes.along, axes.normal], axis=1), self.mount)
@@ -215,7 +215,7 @@ class DirectionsTable(MissionTable, frozen=True):
     def build(self, scenario: Any) -> Any:
         return missions.build_reference(self, missions.from_scenario(scenario))
 
-    def initial_attitude(self, scenario: Any) -> np.ndarray:
+    def initial_reference_attitude(self, scenario: Any) -> np.ndarray:
         self.check(scenario)
         return missions.mounted_quaternion(
             missions.sample_reference(self, missions.from_scenario(scenario)).matrix, self.mount

@@ -14,8 +14,8 @@ from ptsmc_jax.theory import stability_limits
 
 DEADBEAT_REMAINDER = 5e-5  # remaining fraction of an error after one period that counts as deadbeat
 NEGLIGIBLE = 0.05  # relative change of the mean derivative of the sign at s = 0 that counts as no influence
-WIDEST_TO_NOISE = 1e4  # thickest boundary layer / noise of s: the switching term then nearly vanishes
-NOISELESS_RANGE = (1e-2, 1e2)  # thinnest and thickest boundary layer without noise / default thickness
+WIDEST_TO_NOISE = 1e4  # thickest boundary layer relative to the noise of s: the switching term then nearly vanishes
+NOISELESS_RANGE = (1e-2, 1e2)  # thinnest and thickest boundary layer without noise, relative to the default thickness
 
 
 def dead_beat_gain(scenario: Any) -> float:

@@ -257,7 +257,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
     def start_angle(self) -> float:
         """Return the largest angle to the reference at t = 0 [rad], dispersions included."""
         start = np.asarray(attitude_keys.quaternion(self.initial, "initial"), dtype=float)
-        target = np.asarray(self.reference.initial_attitude(self), dtype=float)
+        target = np.asarray(self.reference.initial_reference_attitude(self), dtype=float)
         target = target * np.copysign(1.0, start @ target)  # both signs are the same attitude
         angle = 4.0 * float(np.arctan2(np.linalg.norm(start - target), np.linalg.norm(start + target)))
         for table in (getattr(self.dispersion, "attitude", None), getattr(self.dispersion, "reference", None)):
@@ -333,7 +333,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         return spacecraft(self.spacecraft.inertia)
 
     def true_plant(self, model: Any) -> Any:
-        """Return the true plant: the body with its true inertia and its flexible modes."""
+        """Return the true plant: the body with its true inertia and its flexible modes; model: not used."""
         modes = self.flexible
         if modes is None:
             return spacecraft(self.true_inertia)

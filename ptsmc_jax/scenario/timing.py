@@ -162,7 +162,7 @@ def _count_substeps(scenario: Scenario, period: float, frequencies: Mapping[str,
 
     RK4 with 0.025 rad per step has an error of about 1e-9 rad over 100 s. For disturbances, flexible modes and custom
     systems, 0.1 rad per step gives a relative error of about 1e-7. A torque that changes within the period, because of
-    a lag or a rate limit, needs no further steps: its impulse and first moment are exact, see `Actuators.over`.
+    a lag or a rate limit, needs no further steps: its impulse and first moment are exact, see `Actuators.torque_over`.
     """
     frequencies = {key: value / (4 if key in _SMOOTH_MOTIONS else 1) for key, value in frequencies.items()}
     needed = period * _fastest_frequency(frequencies) / 0.025

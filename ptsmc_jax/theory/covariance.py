@@ -15,7 +15,7 @@ from ptsmc_jax.theory import linear, lower_bound
 ROUNDS = 8  # Largest number of iterations of the statistical linearisation.
 LARGEST_SIGMA = 1e60  # Upper limit of 1 sigma of s, if the covariance overflows.
 FLAT_WIDTH = 1e30  # Thickness of a boundary layer in which the switching term is practically zero.
-_GRID = np.linspace(-20.0, 20.0, 401)
+_GRID = np.linspace(-20.0, 20.0, 401)  # integration grid of expectations over Gaussian noise
 _SECH_SQUARED, _GAUSSIAN = 1.0 / np.cosh(_GRID) ** 2, np.exp(-(_GRID**2) / 2.0)
 
 
@@ -86,8 +86,8 @@ class _SignLoops(NamedTuple):
     """
 
     loops: Any  # a `linear.Loop` of NumPy arrays with a leading period axis
-    widths: np.ndarray  # (periods,) equivalent widths.
-    scenario_width: float  # Width in the scenario.
+    widths: np.ndarray  # (periods,) equivalent thicknesses of the boundary layer.
+    scenario_width: float  # Thickness of the boundary layer in the scenario.
     units: np.ndarray  # (periods,) unit of s, relative to its unit after the hand-over.
 
 
@@ -106,8 +106,8 @@ def _equivalent_width(width: float, sigma: float) -> float:
 class _LinearMap(NamedTuple):
     """Linear map from the propagated state and the noise of one sample to an output, for one or for all periods."""
 
-    state: np.ndarray  # (rows, size).
-    noise: np.ndarray  # (rows, readings), multiplied by 1 sigma.
+    state: np.ndarray  # (rows, size) Derivative of the output by the propagated state.
+    noise: np.ndarray  # (rows, readings) Derivative of the output by the noise of readings, times its 1 sigma.
 
     def covariance(self, p: np.ndarray) -> np.ndarray:
         """Return the output covariance (rows, rows), given p (size, size), the state covariance before the sample."""

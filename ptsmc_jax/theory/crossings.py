@@ -58,7 +58,7 @@ class SchurOpening(NamedTuple):
         a, n = self.opening.a, self.opening.a.shape[0]
 
         def substitute(off_diagonal: Array, b: Array, *, up: bool) -> Array:
-            """Return (z I - A)^-1 b by substitution, for all points at once; rest: A without its diagonal."""
+            """Return (z I - A)^-1 b by substitution, for all points at once; off_diagonal: A without its diagonal."""
 
             def eliminate(k: Array, x: Array) -> Array:
                 i = n - 1 - k if up else k
@@ -160,7 +160,7 @@ class Brackets(NamedTuple):
 
 
 def find_brackets(w: Array, L: Array) -> Brackets:
-    """Return the grid intervals that contain crossings of one axis.
+    """Return the grid intervals that contain crossings of L of one axis, see `Brackets`.
 
     Args:
         w: grid frequencies (points,) [rad/s], ascending.
@@ -178,8 +178,8 @@ def find_brackets(w: Array, L: Array) -> Brackets:
     j, k = jnp.concatenate(places[:3]), jnp.maximum(places[3], 1)
     derivative = (distance[1:] - distance[:-1]) / jnp.where(w[1:] == w[:-1], 1.0, w[1:] - w[:-1]) / 2
 
-    def crossing_values(at: Array) -> Array:
-        return jnp.append(phase_sine[at][: KIND_ENDS[0]], size[at][KIND_ENDS[0] :])
+    def crossing_values(indices: Array) -> Array:
+        return jnp.append(phase_sine[indices][: KIND_ENDS[0]], size[indices][KIND_ENDS[0] :])
 
     return Brackets(
         low=jnp.append(w[j], w[k - 1]),
@@ -276,8 +276,9 @@ def find_zeros(values: Complex[Array, "rows points"], count: int) -> tuple[Array
         direction = above[begin] - above[end]
         return jnp.where(direction * (x[begin] * y[end] - x[end] * y[begin]) > 0.0, direction, 0)
 
-    every, first, later = slice(None), slice(None, -1), slice(1, None)
-    by_points, by_rows = count_crossing((every, first), (every, later)), count_crossing((first, every), (later, every))
+    every, but_last, but_first = slice(None), slice(None, -1), slice(1, None)
+    by_points = count_crossing((every, but_last), (every, but_first))
+    by_rows = count_crossing((but_last, every), (but_first, every))
     winding = by_points[:-1] + by_rows[:, 1:] - by_points[1:] - by_rows[:, :-1]
     inside = jnp.append(winding != 0, x[:-1, -1:] * x[1:, -1:] < 0.0, axis=1)
     rows, places = smallest_values(jnp.where(inside, jnp.arange(len(inside))[:, None], jnp.inf).reshape(-1), count)

@@ -28,7 +28,8 @@ def sliding_envelope(parts: Parts) -> tuple[float, float]:
 
         c = 2 beta / (2 eta + n - 4),  beta = (factor of tau^(n-1) sign(s) in s') * components * 0.2785 width
 
-    c is 0 for the discontinuous sign, which gives (15), (32) and (43) of the paper.
+    s0 is |s|_2 at t = 0, tau = t_f - t is the time to go [s], and r = tau / t_f. c is 0 for the discontinuous sign,
+    which gives (15), (32) and (43) of the paper.
     """
     law, n = parts.controller, parts.controller.order
     beta = switching_rate(parts) * parts.plant.inputs * TANH_LOSS * float(law.layer_width(jnp.asarray(False)))
@@ -94,9 +95,9 @@ def error_bound(parts: Parts, t: ArrayLike) -> np.ndarray:
 def _error_bound(parts: Parts, t: Array, s0: Scalar, residual: Scalar) -> Array:
     law = parts.controller
 
-    def component(time: Scalar, x0: Vector) -> Scalar:
+    def component_bound(time: Scalar, x0: Vector) -> Scalar:
         centre, half = state_envelope(time, law.t_f, law.eta, x0, s0, residual)
         return jnp.abs(centre[0]) + half[0]
 
-    sizes = jax.vmap(lambda time: jax.vmap(lambda x0: component(time, x0))(initial_errors(parts)))(t)
-    return jnp.sqrt(jnp.sum(sizes**2, axis=1))
+    bounds = jax.vmap(lambda time: jax.vmap(lambda x0: component_bound(time, x0))(initial_errors(parts)))(t)
+    return jnp.sqrt(jnp.sum(bounds**2, axis=1))

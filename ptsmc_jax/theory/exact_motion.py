@@ -108,10 +108,10 @@ def _(kinematics: SecondOrderKinematics, target: Any, start: Any, errors: Errors
     error, error_rate, acceleration = errors
     model, n = kinematics.model, kinematics.model.inputs
 
-    def newton(_: Any, x: State) -> State:
+    def newton_step(_: Any, x: State) -> State:
         residual = model.position_rate(target, x) - error_rate
         return jnp.concatenate([error, x[n : 2 * n] - matrices.solve(model.rate_jacobian(target, x), residual)])
 
-    x = jax.lax.fori_loop(0, 8, newton, jnp.concatenate([error, start[n : 2 * n]]))
+    x = jax.lax.fori_loop(0, 8, newton_step, jnp.concatenate([error, start[n : 2 * n]]))
     w_dot = matrices.solve(model.rate_jacobian(target, x), acceleration - model.coasting_acceleration(target, x))
     return Motion(x, w_dot, kinematics.singularity_distance(x, target))

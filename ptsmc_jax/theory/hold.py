@@ -112,10 +112,10 @@ def _hand_over_bounds(parts: Parts) -> _HandOver:
 def _bounds_at_hand_over(parts: Parts, s0: Scalar, residual_before: Scalar, limit: Scalar) -> _HandOver:
     law = parts.controller
 
-    def component(x0: Vector) -> tuple[Vector, Vector]:
+    def component_interval(x0: Vector) -> tuple[Vector, Vector]:
         return solutions.state_envelope(law.hand_over, law.t_f, law.eta, x0, s0, residual_before)
 
-    centre, half = jax.vmap(component)(solutions.initial_errors(parts))
+    centre, half = jax.vmap(component_interval)(solutions.initial_errors(parts))
     weights = jnp.append(law.surface(), 1.0)
     return _HandOver(centre, half, jnp.abs(centre @ weights) + half @ jnp.abs(weights), limit)
 
@@ -127,7 +127,8 @@ def _error_bound(parts: Parts, hand_over: _HandOver, lags: Vector, t: Array) -> 
     on_surface = jnp.eye(n, n - 1).at[-1].set(-surface)  # basis (columns) of the states with s = 0
     off_surface = jnp.eye(n)[-1]  # the state with s = 1 and all other states 0
 
-    def bound_at(elapsed: Scalar) -> Scalar:
+    def error_bound_after(elapsed: Scalar) -> Scalar:
+        """Return the bound on the 2-norm of the error, `elapsed` [s] after the hand-over."""
         surface_response = integrators.phi_functions(hold_matrix(surface, rate) * elapsed, 0)[0][0] @ on_surface
         decaying_response, constant_response = (
             exact_hold(elapsed, lags, k, off_surface).x[0] for k in (rate, jnp.zeros_like(rate))
@@ -136,4 +137,4 @@ def _error_bound(parts: Parts, hand_over: _HandOver, lags: Vector, t: Array) -> 
         free_bound = jnp.abs(centre @ surface_response) + half @ jnp.abs(surface_response)
         return guards.norm(free_bound + hand_over.s * decaying_response + hand_over.limit * constant_response)
 
-    return jax.vmap(bound_at)(t - law.hand_over)
+    return jax.vmap(error_bound_after)(t - law.hand_over)

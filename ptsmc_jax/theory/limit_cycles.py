@@ -34,14 +34,14 @@ FEWEST_REVERSALS = 4  # Smallest number of reversals of the command.
 SLOWEST = 40  # Largest mean number of samples between two reversals.
 SUSTAINED = 0.75  # Smallest ratio of the command's variation in the second half of the examined periods to the first.
 NONLINEAR = 0.1  # Smallest nonlinear fraction of a limit cycle: residual relative to the change of the command.
-ROUNDING = 1e-8  # Rounding error, relative to the largest command.
+ROUNDING = 1e-8  # Rounding error of commands, relative to the largest command.
 
 
 class History(NamedTuple):
     """Commands of a nominal run in each control period."""
 
     command: Array  # (periods, m) [N m]
-    in_hold: Array  # (periods,) bool: full periods in the hold phase
+    in_hold: Array  # (periods,) bool: whether a period has the full length and begins in the hold phase
 
 
 def command_history(parts: Parts, run: linear.NominalRun) -> History:
@@ -100,13 +100,13 @@ def _measure_cycle(u: np.ndarray, residual: np.ndarray) -> LimitCycle:
         u: commands of the axis (times,) [N m].
         residual: part of the commands that the linearisation does not explain (times,) [N m].
     """
-    periods = 2.0 * (residual.size - 1) / float(np.count_nonzero(_reversals(residual, 0.0)))
+    periods = 2.0 * (residual.size - 1) / float(np.count_nonzero(_sign_changes(residual, 0.0)))
     cycles = np.lib.stride_tricks.sliding_window_view(u, int(np.ceil(periods)))
     return LimitCycle(float(np.median(np.ptp(cycles, axis=1))), periods)
 
 
-def _reversals(values: np.ndarray, threshold: Any) -> np.ndarray:
-    """Return the sign changes of values (times,), ignoring values of at most `threshold` in size."""
+def _sign_changes(values: np.ndarray, threshold: Any) -> np.ndarray:
+    """Return whether each value above `threshold` in size differs in sign from the next one, bool; values (times,)."""
     signs = np.sign(values[np.abs(values) > threshold])
     return signs[1:] != signs[:-1]
 
@@ -114,7 +114,7 @@ def _reversals(values: np.ndarray, threshold: Any) -> np.ndarray:
 def _is_oscillating(values: np.ndarray, threshold: Any) -> np.ndarray:
     """Return which columns of values (times, m) change their sign often enough to be a limit cycle, (m,) bool."""
     threshold = np.broadcast_to(threshold, values.shape[1])
-    reversals = [np.count_nonzero(_reversals(v, low)) for v, low in zip(values.T, threshold, strict=True)]
+    reversals = [np.count_nonzero(_sign_changes(v, low)) for v, low in zip(values.T, threshold, strict=True)]
     return np.asarray(reversals) >= max(FEWEST_REVERSALS, values.shape[0] / SLOWEST)
 
 
@@ -130,7 +130,7 @@ def _nonlinear_residual(parts: Parts, run: linear.NominalRun) -> tuple[Array, Ar
     parts = linear.quiet(parts)
     k2, kinematics, model = parts.observer.error_bound(), parts.controller.kinematics, parts.observer.model
 
-    def in_period(period: computer.Period, before: computer.Computer, seen: Any) -> tuple[Array, Array]:
+    def residual_in_period(period: computer.Period, before: computer.Computer, seen: Any) -> tuple[Array, Array]:
         target = parts.reference(period.now.t)
         d_hat, _ = computer.estimate(parts, period, before, seen)
 
@@ -148,7 +148,7 @@ def _nonlinear_residual(parts: Parts, run: linear.NominalRun) -> tuple[Array, Ar
         change = command(to_zero_error) - command_here
         return change - linear_change, change
 
-    return lapack.vmap(in_period)(run.period, run.carry.computer, run.after.computer.seen)
+    return lapack.vmap(residual_in_period)(run.period, run.carry.computer, run.after.computer.seen)
 
 
 def zero_margins(margins: Any, rows: Any) -> Any:

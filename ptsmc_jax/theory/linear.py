@@ -69,8 +69,8 @@ class NominalRun(NamedTuple):
     """Nominal run without noise and disturbance; the first axis of all arrays is the control period."""
 
     period: Period
-    carry: Carry  # before the period
-    after: Carry  # after the period
+    carry: Carry  # state of the loop at the start of the period
+    after: Carry  # state of the loop at the end of the period
     command: Array  # u that acts in the period, after the delay
 
 
@@ -160,7 +160,8 @@ def _apply_commands(
 
     if len(commands) == 1:
         return apply_command((carry.x, carry.actuators), commands[0])[0]
-    stacked = jax.tree.map(lambda *v: jnp.stack(v), *commands)  # a loop: the motion is traced and compiled once
+    # a scan, so that JAX traces and compiles the motion once
+    stacked = jax.tree.map(lambda *v: jnp.stack(v), *commands)
     return jax.lax.scan(apply_command, (carry.x, carry.actuators), stacked)[0]
 
 
@@ -175,7 +176,7 @@ class LinearisedPeriod(NamedTuple):
 
 
 def linearise_period(parts: Parts, nominal_period: NominalRun, *, fractional_delays: bool = True) -> LinearisedPeriod:
-    """Linearise and open the loop in one control period of the nominal run; see `Loop`, h in [s].
+    """Linearise and open the loop in one control period of the nominal run, see `Loop`; the period h is in [s].
 
     The function does not use the clock of the scenario.
 
@@ -247,7 +248,7 @@ def linearise_periods(
     *,
     fractional_delays: bool = True,
 ) -> LinearisedPeriod:
-    """Linearise and open the loop in several periods, h in [s]; the first axis of the result is the period.
+    """Linearise and open the loop in several control periods, stacked along the first axis; the period h is in [s].
 
     The same compiled program is used for any number of periods.
 
@@ -256,19 +257,19 @@ def linearise_periods(
         run: the nominal run.
         indices: numbers of the periods (periods,).
         widths: thickness of the law's boundary layer in each period (periods,), or None for the law's `sign_width`.
-        fractional_delays: see `linearise_period`.
+        fractional_delays: whether to compute N and O at all `NODES`, see `linearise_period`.
     """
     parts = replace(parts, clock=clock.flight_clock(1.0, 1.0))
     selected = jax.tree.map(lambda v: np.asarray(v)[indices], run), widths
 
-    def call(k: int) -> LinearisedPeriod:
+    def linearise_batch(k: int) -> LinearisedPeriod:
         batch = np.resize(np.arange(k, min(k + PERIODS_PER_CALL, len(indices))), PERIODS_PER_CALL)
         runs_and_widths = jax.tree.map(lambda v: v[batch], selected)
         result = _linearise_batch(parts, *runs_and_widths, fractional_delays=fractional_delays)
         return jax.tree.map(np.asarray, result)
 
-    calls = [call(k) for k in range(0, len(indices), PERIODS_PER_CALL)]
-    return jax.tree.map(lambda *blocks: np.concatenate(blocks)[: len(indices)], *calls)
+    batches = [linearise_batch(k) for k in range(0, len(indices), PERIODS_PER_CALL)]
+    return jax.tree.map(lambda *blocks: np.concatenate(blocks)[: len(indices)], *batches)
 
 
 @programs.jit(static_argnames=("fractional_delays",), compiler_options=programs.FAST_COMPILE)
@@ -285,7 +286,7 @@ def _linearise_batch(
 
 
 def open_loops(parts: Parts, run: NominalRun, indices: np.ndarray) -> Loop:
-    """Return the opened loops of several periods, h in [s]; the first axis of the result is the period.
+    """Return the opened loops of several control periods, stacked along the first axis; the period h is in [s].
 
     If a star tracker is slower than the loop, each loop is the mean over the star tracker's interval.
 
@@ -299,13 +300,13 @@ def open_loops(parts: Parts, run: NominalRun, indices: np.ndarray) -> Loop:
 
 
 def open_loops_traced(parts: Parts, run: NominalRun, indices: Array, *, fractional_delays: bool = True) -> Loop:
-    """Return the loops of `open_loops`, h in [s], inside a JAX transformation: the indices may be tracers.
+    """Return the loops of `open_loops`, period h in [s], inside a JAX transformation: the indices may be tracers.
 
     Args:
         parts: the scenario.
         run: the nominal run.
         indices: numbers of the periods (periods,).
-        fractional_delays: see `linearise_period`.
+        fractional_delays: whether to compute N and O at all `NODES`, see `linearise_period`.
     """
     periods = _periods_to_average(parts, indices)
 
@@ -381,7 +382,7 @@ class Opening(NamedTuple):
 
 
 def open_at_input(loop: Loop, extra_delay: float = 0.0, xp: Any = jnp) -> Opening:
-    """Return the loop opened at the plant's input, B (n, m), with an additional delay of the command [N m].
+    """Return the loop opened at the plant's input (command [N m], B (n, m)), with an additional delay in periods.
 
     Args:
         loop: the linearised loop.
@@ -415,7 +416,7 @@ def open_at_sensors(loop: Loop) -> Opening:
 
 
 def delay_one_axis(loop: Loop, z: Array, extra_delay: Scalar, axis: Any) -> Opening:
-    """Return the loop opened at the plant's input, B (n, m), with an additional delay of one axis, valid at one z [-].
+    """Return the loop opened at the plant's input, B (n, m), with a delay of one axis; it is valid at only one z [-].
 
     The loop transfer matrix is z^-`loop.delay` times the L(z) of the result.
 

@@ -56,26 +56,26 @@ class LowerBound:
 class Model(NamedTuple):
     """Linear-Gaussian model of `periods` control periods: z' = F (z + B v), y = H z + n.
 
-    Each period begins with the sample. Then the process noise v acts, and then the state moves. v and n are
-    independent. If the model combines several runs, the axis of the runs follows the axis of the periods, and all runs
-    have readings at the same samples.
+    z is the state, v the process noise, y are the readings, and n is their noise. Each period begins with the sample.
+    Then v acts, and then the state moves. v and n are independent. If the model combines several runs, the axis of the
+    runs follows the axis of the periods, and all runs have readings at the same samples.
     """
 
-    start: np.ndarray  # (.., n, k) Factor S of the covariance S S' before the first sample.
-    rows: np.ndarray  # (m, n) H, or (periods, .., m, n).
+    start: np.ndarray  # (.., n, k) Factor S of the covariance S S' of z before the first sample.
+    rows: np.ndarray  # (m, n) or (periods, .., m, n): H, derivatives of the readings by z.
     noise: np.ndarray  # (periods, .., m) 1 sigma of each reading; infinite if the reading is not available.
-    process_noise: np.ndarray  # (periods, .., n, v) B, times the 1 sigma of v.
-    transition: np.ndarray  # (periods, .., n, n) F.
-    output: np.ndarray  # (periods, .., outputs, n) Derivatives of the outputs by z + B v.
+    process_noise: np.ndarray  # (periods, .., n, v) B, with each column times the 1 sigma of its component of v.
+    transition: np.ndarray  # (periods, .., n, n) F, transition matrix of z over a period.
+    output: np.ndarray  # (periods, .., outputs, n) Derivatives of the outputs, such as errors, by the state z + B v.
 
 
 def bound_along_run(parts: Parts, log: Log) -> LowerBound:
-    """Return the lower bound along a run with this history (`rollout.simulate`, record=True)."""
+    """Return the lower bound on the error along a run, from its history (`rollout.simulate`, record=True)."""
     return bounds_along_runs([(parts, log)])[0]
 
 
 def bounds_along_runs(runs: Sequence[tuple[Parts, Log]]) -> list[LowerBound]:
-    """Return the lower bound along each of several runs of a scenario; runs with equal shapes are computed together."""
+    """Return the lower bound on the error along each of several runs; runs with equal shapes are computed together."""
     nonzero = [(parts, *_nonzero_periods(parts, log)) for parts, log in runs]
     groups = dict[tuple, dict[int, Model]]()  # by delay, available samples and shapes
     for k, (parts, ticks, log) in enumerate(nonzero):
@@ -227,7 +227,8 @@ def _build_model(parts: Parts, log: Log, ticks: Ticks) -> Model:
     size, torque = n + sensor_states + m + len(places), slice(n + sensor_states, n + sensor_states + m)
 
     def widen_rows(rows: np.ndarray) -> np.ndarray:
-        seen = rows.shape[-1] - sensor_states  # the flexible modes, which no sensor reads, follow the seen states
+        """Return derivatives by seen states and sensor states as derivatives by all states, with zeros elsewhere."""
+        seen = rows.shape[-1] - sensor_states  # flexible modes follow the seen states; no sensor reads them
         rows = np.insert(rows, [seen] * (n - seen), 0.0, axis=-1)
         return np.pad(rows, [*[(0, 0)] * (rows.ndim - 1), (0, size - rows.shape[-1])])
 
@@ -309,19 +310,19 @@ def walk_intensity(parts: Parts) -> np.ndarray:
 
 
 class _RunJacobians(NamedTuple):
-    """Jacobians of each control period with respect to the initial state and to a constant torque.
+    """Derivatives of states, errors and readings in each control period by z and p, along a run.
 
     z (n,) are the plant's local coordinates at the start of the period. p (m,) is a torque on the plant that is
     constant in the period [N m].
     """
 
-    transition: Array  # (periods, n, n) State at the end by z.
-    push: Array  # (periods, n, m) State at the end by p.
-    error: Array  # (periods, 3 m, n) Error at the start, in the middle (interpolated) and at the end by z.
-    error_push: Array  # (periods, 3 m, m) The same errors by p.
-    early: Array  # (periods, k, n) Measured quantities at sample times within the period by z; k = 0 without them.
-    early_push: Array  # (periods, k, m) The same quantities by p.
-    now: Array  # (periods, readings, n) Readings of a sensor suite at the start of the period by z; else no rows.
+    transition: Array  # (periods, n, n) Derivative of the state at the end of the period by z.
+    push: Array  # (periods, n, m) Derivative of the same state by p.
+    error: Array  # (periods, 3 m, n) Derivative by z of the error at start, middle and end; middle is interpolated.
+    error_push: Array  # (periods, 3 m, m) Derivative of the same errors by p.
+    early: Array  # (periods, k, n) Derivative by z of quantities measured within the period; k = 0 without them.
+    early_push: Array  # (periods, k, m) Derivative of the same quantities by p.
+    now: Array  # (periods, readings, n) Derivative by z of a sensor suite's readings at the start; else no rows.
 
 
 @programs.jit(compiler_options=programs.FAST_COMPILE)

@@ -25,13 +25,13 @@ from ptsmc_jax.theory.linear import Loop, Opening
 CIRCLE_TOLERANCE = (
     1e-6  # Poles up to this distance outside the unit circle count as stable; wheel momentum has poles at 1.
 )
-NEAREST = 3  # Number of crossings |L| = 1 with the smallest estimated delays from which Newton's method starts.
+NEAREST = 3  # Number of estimated delay margins, from crossings |L| = 1, at which Newton's method starts.
 SEARCHED_PERIODS = 8  # Largest delay of the grid search for the delay margin, in periods.
-STEPS_PER_PERIOD = 16  # Steps of this grid search per period.
-GRID_ZEROS = 6  # Number of results of the grid search from which Newton's method starts.
+STEPS_PER_PERIOD = 16  # Steps per period of the grid search for the delay margin.
+GRID_ZEROS = 6  # Number of delays found by the grid search at which Newton's method starts.
 LOOPS_PER_CALL = 2  # Loops in one call of the compiled program: each point of a margin map has two.
-MOST_STARTS = 8  # Largest number of Newton starts near an estimated delay.
-START_DISTANCE = 0.15  # Distance between these starts, in periods.
+MOST_STARTS = 8  # Largest number of attempts of Newton's method for each estimated delay margin.
+START_DISTANCE = 0.15  # Increase of the starting delay from one attempt of Newton's method to the next, in periods.
 
 
 class Margins(NamedTuple):
@@ -77,8 +77,8 @@ def compute_each(loops: Loop, sensors: bool = False, with_delay: bool = True) ->
 
     Args:
         loops: the loops.
-        sensors: see `compute`.
-        with_delay: see `compute`.
+        sensors: whether to open the loops at the sensors instead of the plant's input, see `compute`.
+        with_delay: whether to compute the delay margin; otherwise it is NaN.
     """
     return jax.lax.map(partial(compute, sensors=sensors, with_delay=with_delay), loops)
 
@@ -91,12 +91,12 @@ def compute_in_batches(loops: Loop) -> Margins:
     """
     count = np.shape(loops.period)[0]
 
-    def call(k: int) -> Margins:
+    def compute_batch(k: int) -> Margins:
         batch = np.resize(np.arange(k, min(k + LOOPS_PER_CALL, count)), LOOPS_PER_CALL)
         return jax.tree.map(np.asarray, compute_each(jax.tree.map(lambda v: np.asarray(v)[batch], loops)))
 
-    calls = [call(k) for k in range(0, count, LOOPS_PER_CALL)]
-    return jax.tree.map(lambda *blocks: np.concatenate(blocks)[:count], *calls)
+    batches = [compute_batch(k) for k in range(0, count, LOOPS_PER_CALL)]
+    return jax.tree.map(lambda *blocks: np.concatenate(blocks)[:count], *batches)
 
 
 class _Spectrum(NamedTuple):
@@ -113,7 +113,7 @@ class _Spectrum(NamedTuple):
     def evaluate(self, w: Array, *, with_gradients: bool) -> tuple[Array, Array]:
         """Return L of each axis and its derivative by w, at frequencies w (m, places) [rad/s] of each axis.
 
-        with_gradients: whether L has gradients by the loop.
+        with_gradients: whether L can be differentiated by the numbers of the loop.
         """
         m, places = w.shape
         z = jnp.exp(1j * w.reshape(-1) * jax.lax.stop_gradient(self.loop.period))
@@ -142,7 +142,7 @@ def _open_loop_spectrum(loop: Loop, open_loop: Callable[[Loop], Opening] = linea
 
 
 def compute(loop: Loop, sensors: bool = False, with_delay: bool = True) -> Margins:
-    """Return the margins of each axis of a loop, or NaN if the loop contains numbers that are not finite.
+    """Return the margins of a loop opened at the plant's input or at the sensors; NaN if the loop is not finite.
 
     Args:
         loop: the loop.
@@ -267,7 +267,7 @@ def _axis_margins(root: Array, L: Array, L_derivative: Array, exists: Array, sta
         gain_down=jnp.where(stable, jnp.where(down < LARGEST_MARGIN, down, jnp.inf), -nearest),
         phase=jnp.where(stable, 1.0, -1.0) * jnp.min(angles),
         delay=jnp.zeros_like(up),
-        peak_sensitivity=-20.0 * jnp.log10(jnp.min(jnp.abs(1.0 + L[count:]))),  # L here needs no Newton step
+        peak_sensitivity=-20.0 * jnp.log10(jnp.min(jnp.abs(1.0 + L[count:]))),  # `further` needs no Newton step
         stable=stable,
         crossover=jnp.where(exists[unit_gains][worst], root[unit_gains][worst], jnp.nan),
     )
@@ -288,26 +288,25 @@ def _delay_margin(loop: Loop, w: Array, response: Array, axis: Array) -> Scalar:
     attempts = jnp.append(jnp.ones(len(grid_limits), int), jnp.full(NEAREST, MOST_STARTS))
 
     def find_limit(task: tuple) -> tuple[Array, Array]:
-        """Return ln w and the delay in periods at a stability limit, and whether Newton's method converged."""
+        """Return ln w and the delay in periods at a stability limit, and whether a positive delay was found."""
         start, attempts = task
         is_finite = jnp.isfinite(start[1])
 
-        def newton(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+        def newton_step(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
             steps, starts, x, _ = state
             step = _delay_step(fixed_loop, fixed_schur, axis, x)
             x = x - step
             converged = jnp.all(jnp.abs(step) <= 1e-9 * jnp.maximum(jnp.abs(x), 1.0))  # convergence is quadratic
             has_limit = converged & (x[1] > 0.0)
-            failed = ~has_limit & (
-                converged | (steps == 11) | ~jnp.all(jnp.isfinite(x))
-            )  # delay not positive, or diverged
+            # an attempt fails if it converges to a delay that is not positive, takes 12 steps, or diverges
+            failed = ~has_limit & (converged | (steps == 11) | ~jnp.all(jnp.isfinite(x)))
             starts = starts + failed
             x = jnp.where(failed, start.at[1].add(START_DISTANCE * starts), x)
             return jnp.where(failed, 0, steps + 1), starts, x, has_limit
 
         zero = jnp.zeros((), int)
         initial = (zero, zero, jnp.where(is_finite, start, 1.0), ~is_finite)
-        *_, root, has_limit = jax.lax.while_loop(lambda state: ~state[3] & (state[1] < attempts), newton, initial)
+        *_, root, has_limit = jax.lax.while_loop(lambda state: ~state[3] & (state[1] < attempts), newton_step, initial)
         return root, is_finite & has_limit
 
     roots, has_limit = jax.lax.map(find_limit, (starts, attempts))
@@ -320,15 +319,15 @@ def _delay_margin(loop: Loop, w: Array, response: Array, axis: Array) -> Scalar:
 
 
 def _delay_grid_search(loop: Loop, schur_a: tuple[Array, Array], w: Array, axis: Array) -> Array:
-    """Return approximate stability limits (NEAR, 2), ln w and delay in periods, by a search on a grid of both.
+    """Return approximate stability limits (`GRID_ZEROS`, 2), ln w and delay in periods, by a search on a grid of both.
 
     A grid cell contains a zero of 1 + L if 1 + L winds around 0 along the edges of the cell. The function returns the
     zeros with the smallest delays. The delay is infinite if there are fewer than `GRID_ZEROS` zeros.
 
     Args:
         loop: the loop.
-        schur_a: see `_delay_step`.
-        w: frequencies [rad/s].
+        schur_a: `crossings.schur_form` of A of the loop closed at its sensors.
+        w: grid frequencies [rad/s].
         axis: number of the delayed axis.
     """
     a, command = loop.closed_at_sensors()
@@ -339,11 +338,12 @@ def _delay_grid_search(loop: Loop, schur_a: tuple[Array, Array], w: Array, axis:
     to_schur = jnp.conj(schur.axes.T)
     response = -jnp.einsum("nkp,nm->pkm", y, to_schur @ loop.new[0])
 
-    def axis_value(response: Array, column: Array) -> Array:  # L of the axis, linear in its column of the response
+    def axis_response_with(response: Array, column: Array) -> Array:
+        """Return L of the delayed axis, others closed, with `column` as its column of L. L is linear in `column`."""
         return crossings.axis_response(response.at[:, axis].set(column), axis)
 
     unit_vectors = jnp.eye(command.shape[0]) + 0j
-    by_column = jax.vmap(jax.vmap(axis_value, (None, 0)), (0, None))(response, unit_vectors)
+    by_column = jax.vmap(jax.vmap(axis_response_with, (None, 0)), (0, None))(response, unit_vectors)
     y = jnp.einsum("nkp,pk->np", y, by_column)
     new, old = (-jnp.einsum("np,nq->qp", y, to_schur @ delayed[:, :, axis].T) for delayed in (loop.new, loop.old))
     schur_loop = replace(loop, new=new, old=old / z[None])
@@ -389,32 +389,32 @@ def simultaneous_margins(loop: Loop) -> dict[str, float]:
     beyond 80 dB, 180 deg or 200 periods are infinite. All values are NaN if the loop is unstable.
     """
 
-    def unstable(gain: Any = 1.0, delay: float = 0.0) -> bool:
+    def is_unstable(gain: Any = 1.0, delay: float = 0.0) -> bool:
         return not linear.spectral_radius(loop, gain, delay) < 1.0 + CIRCLE_TOLERANCE
 
-    def smallest_change(is_lost: Callable[[float], bool], values: np.ndarray) -> float:
+    def smallest_change(is_unstable_at: Callable[[float], bool], values: np.ndarray) -> float:
         """Return the smallest change that makes the loop unstable, bracketed by `values` and refined by bisection."""
         low = 0.0
         for high in values:
-            if is_lost(high):
+            if is_unstable_at(high):
                 for _ in range(40):
                     middle = 0.5 * (low + high)
-                    low, high = (low, middle) if is_lost(middle) else (middle, high)
+                    low, high = (low, middle) if is_unstable_at(middle) else (middle, high)
                 return float(high)
             low = high
         return float("inf")
 
-    if not all(np.isfinite(v).all() for v in jax.tree.leaves(loop)) or unstable():
+    if not all(np.isfinite(v).all() for v in jax.tree.leaves(loop)) or is_unstable():
         return dict.fromkeys(FIELDS, float("nan"))
     response, _ = _responses(loop)[1:]
     smallest = np.linalg.svd(np.eye(response.shape[1]) + np.asarray(response), compute_uv=False)[:, -1].min()
     decibels, degrees = np.arange(1.0, 81.0), np.arange(2.0, 181.0, 2.0)
     periods = np.unique(np.append(np.linspace(0.0, 10.0, 41)[1:], np.geomspace(10, 200, 40)))
     results = (
-        smallest_change(lambda dB: unstable(10.0 ** (dB / 20.0)), decibels),
-        smallest_change(lambda dB: unstable(10.0 ** (-dB / 20.0)), decibels),
-        smallest_change(lambda angle: unstable(np.exp(-1j * np.deg2rad(angle))), degrees),
-        smallest_change(lambda delay: unstable(delay=delay), periods) * float(loop.period),
+        smallest_change(lambda dB: is_unstable(10.0 ** (dB / 20.0)), decibels),
+        smallest_change(lambda dB: is_unstable(10.0 ** (-dB / 20.0)), decibels),
+        smallest_change(lambda angle: is_unstable(np.exp(-1j * np.deg2rad(angle))), degrees),
+        smallest_change(lambda delay: is_unstable(delay=delay), periods) * float(loop.period),
         float(-20.0 * np.log10(smallest)),
     )
     return dict(zip(FIELDS, results, strict=True))

@@ -48,7 +48,7 @@ def boundary_layer(law: PrescribedTimeLaw, k2: Scalar, visited: tuple[Any, Any] 
     Args:
         law: the prescribed-time law.
         k2: bound on the 2-norm of the estimation error.
-        visited: see `switching_rate`.
+        visited: targets and states of a run, for a second-order system, see `switching_rate`.
     """
     after = switching_rate(law, k2, visited) / law.sign_width
     return (law.t_f / law.layer_time) ** (law.order - 1) * after, after

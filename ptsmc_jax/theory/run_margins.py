@@ -20,7 +20,8 @@ from ptsmc_jax.theory.limit_cycles import History, command_history
 from ptsmc_jax.theory.linear import Loop
 from ptsmc_jax.theory.margins import FIELDS, Margins
 
-SHORTEST = 10  # Shortest time to go, in periods. The gains then change by a tenth from one period to the next.
+# shortest time to go at which margins are computed, in periods; gains then change by a tenth in a period
+SHORTEST = 10
 TIMES = 4  # number of times to go at which margins are computed
 LONGEST = 0.25  # longest time to go at which margins are computed, as a fraction of t_f
 
@@ -29,11 +30,11 @@ class Course(NamedTuple):
     """Margins along a nominal run."""
 
     t: np.ndarray  # (times,) [s] The last is in the hold phase, the others are before the hand-over.
-    judged: np.ndarray  # (times,) bool: whether the frozen loop is meaningful, see `judged_times`.
+    judged: np.ndarray  # (times,) bool: whether the loop with frozen gains is meaningful, see `judged_times`.
     loops: Loop  # The first axis of all arrays is the time.
     at_input: Margins  # (times, m) Margins of the loop opened at each input.
     at_sensors: Margins  # (k,) Margins of the loop opened at each measured signal, in the hold phase.
-    together: dict[str, float]  # Margins in the hold phase against the same change in all inputs.
+    together: dict[str, float]  # Margins in the hold phase if gain, phase or delay changes equally in all inputs.
     singularity_distance: float  # Smallest distance to the singularity, in the unit of `run_state.SINGULAR_DISTANCE`.
     not_converged: bool  # Whether the run has not converged at t_f, see `run_state.is_not_converged`.
     limit_cycle: limit_cycles.LimitCycle | None = None  # Limit cycle in the hold phase, if there is one.

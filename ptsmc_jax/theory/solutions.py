@@ -81,6 +81,8 @@ def exact_sizes(parts: Setup, t: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
 
 @programs.jit
 def _exact_sizes(parts: Setup, t: Array) -> tuple[Array, Array]:
+    """Return the 2-norms of the error and of s at times t, see `exact_sizes`."""
+
     def norms(time: Scalar) -> tuple[Scalar, Scalar]:
         error, s = exact_error_and_s(parts.controller, time, initial_errors(parts))
         return guards.norm(error), guards.norm(s)
@@ -130,13 +132,14 @@ def _visited_states(parts: Setup) -> tuple[Array, Any]:
 def exact_path(parts: Setup, points: int = 2000) -> tuple[Array, Array, Array]:
     """Return times in the approach phase [s], inputs (points, m) and distances to the singularity of the exact motion.
 
-    See `exact_input`.
+    The times become denser toward the hand-over. `exact_input` defines inputs and distances.
     """
     return _exact_path(without_devices(parts), points)
 
 
 @programs.jit(static_argnames="points")
 def _exact_path(parts: Setup, points: int) -> tuple[Array, Array, Array]:
+    """Return times (points,) [s], inputs and distances to the singularity, see `exact_path`."""
     law = parts.controller
     t = law.t_f - law.t_f * (law.delta / law.t_f) ** jnp.linspace(0.0, 1.0, points)
     u, singularity_distance = lapack.vmap(lambda time: exact_input(parts, time))(t)

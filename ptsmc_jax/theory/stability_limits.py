@@ -16,10 +16,10 @@ def gains(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the gains kp [1/s^2] and kd [1/s] of the frozen loop, (times,) each.
 
-    The time to go is tau = t_f - t, and k = (K1 + slope)/2:
+    The time to go is tau = t_f - t, and k = (K1 + g)/2 with the derivative g of the switching term:
 
-        before the hand-over: kp = eta^2/tau^2 + slope eta/2,  kd = (2 eta - 1)/tau + slope tau/2
-        after the hand-over:  kp = c k,                        kd = c + k
+        before the hand-over: kp = eta^2/tau^2 + g eta/2,  kd = (2 eta - 1)/tau + g tau/2
+        after the hand-over:  kp = c k,                    kd = c + k
 
     Args:
         t: times (times,) [s].
@@ -27,15 +27,15 @@ def gains(
         eta: exponent of the law [-].
         delta: time between the hand-over and t_f [s].
         k1: K1 of (60) [1/s].
-        switching_derivative: derivative of the switching term in the boundary layer, |T J^-1| K2 / sign_width.
+        switching_derivative: g, derivative of the switching term in the boundary layer, |T J^-1| K2 / sign_width.
         surface_rate: c [1/s].
     """
     tau = t_f - np.asarray(t, dtype=float)
     hold = tau <= delta * (1 + 1e-9)
-    safe = np.where(hold, 1.0, tau)
+    tau_before = np.where(hold, 1.0, tau)
     after = (k1 + switching_derivative) / 2
-    kp = np.where(hold, surface_rate * after, eta**2 / safe**2 + switching_derivative * eta / 2)
-    kd = np.where(hold, surface_rate + after, (2 * eta - 1) / safe + switching_derivative * safe / 2)
+    kp = np.where(hold, surface_rate * after, eta**2 / tau_before**2 + switching_derivative * eta / 2)
+    kd = np.where(hold, surface_rate + after, (2 * eta - 1) / tau_before + switching_derivative * tau_before / 2)
     return kp, kd
 
 
@@ -86,13 +86,13 @@ def spectral_radius(kp: float, kd: float, h: float, delay: float = 0.0) -> float
     return float(np.abs(np.linalg.eigvals(_transition_matrix(kp, kd, h, delay))).max())
 
 
-def _largest_stable(stable: Callable[[float], bool], low: float, high: float) -> float:
-    """Return the largest number for which `stable` is true, by bisection, or infinity if it is true at `high`."""
-    if stable(high):
+def _largest_stable(is_stable: Callable[[float], bool], low: float, high: float) -> float:
+    """Return the largest number for which `is_stable` is true, by bisection, or infinity if it is true at `high`."""
+    if is_stable(high):
         return float("inf")
     for _ in range(60):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if stable(middle) else (low, middle)
+        low, high = (middle, high) if is_stable(middle) else (low, middle)
     return low
 
 
@@ -127,12 +127,12 @@ def largest_index(eta: float, delay: float = 0.0, *, implicit: bool = False) -> 
             period before t_f.
     """
 
-    def stable(index: float) -> bool:
+    def is_stable(index: float) -> bool:
         tau = (2 * eta - 1) / index
         kp, kd = implicit_gains(eta, tau) if implicit else ((eta / tau) ** 2, (2 * eta - 1) / tau)
         return spectral_radius(kp, kd, 1.0, delay) < 1.0
 
-    return _largest_stable(stable, 1e-6, (2 * eta - 1) * (1 - 1e-9) if implicit else 4.0)
+    return _largest_stable(is_stable, 1e-6, (2 * eta - 1) * (1 - 1e-9) if implicit else 4.0)
 
 
 def smallest_delta(eta: float, h: float, delay: float = 0.0, *, anchored: bool = True, implicit: bool = False) -> float:
@@ -186,11 +186,11 @@ def largest_reaching(surface: float, delay: float = 0.0, *, implicit: bool = Fal
             infinite without delay.
     """
 
-    def stable(reaching: float) -> bool:
+    def is_stable(reaching: float) -> bool:
         kp, kd = surface * reaching, surface + reaching
         if implicit:
             decrease = -np.expm1(-reaching)
             kp, kd = surface * decrease / (1 + surface / 2), (surface + decrease) / (1 + surface / 2)
         return spectral_radius(kp, kd, 1.0, delay) < 1.0
 
-    return _largest_stable(stable, 1e-6, 40.0 if implicit else 4.0) if stable(1e-6) else 0.0
+    return _largest_stable(is_stable, 1e-6, 40.0 if implicit else 4.0) if is_stable(1e-6) else 0.0

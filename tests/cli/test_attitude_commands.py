@@ -33,7 +33,7 @@ def test_simulate_writes_an_ephemeris_that_is_a_reference_of_another_run(command
     for file in ("attitude.aem", "trajectory.csv"):
         tables = tomllib.loads(MULTIPLICATIVE) | {"reference": {"kind": "table", "file": str(tmp_path / "r" / file)}}
         read: Any = scenario.from_tables(tables)
-        np.testing.assert_allclose(read.reference.initial_attitude(read), found.quaternions[0], atol=1e-12)
+        np.testing.assert_allclose(read.reference.initial_reference_attitude(read), found.quaternions[0], atol=1e-12)
 
 
 def test_an_ephemeris_of_a_chain_is_refused(command, tmp_path):
