@@ -71,7 +71,7 @@ class Campaign:
             "bad_time": simulated.bad_time,
             **self._trial_and_seed_columns(wanted),
             **{name: getattr(simulated.metrics, name) for name in self.ready.catalogue},
-            **_sample_counts(simulated.samples),
+            **_sample_count_columns(simulated.samples),
             **simulated.drawn,
             **simulated.custom_metrics,
         })  # fmt: skip
@@ -115,7 +115,7 @@ class Campaign:
         simulated = jax.eval_shape(
             lambda: montecarlo.one(*arguments, custom_metrics=call_and_check, software=self.software)
         )
-        counts = _sample_counts(simulated.samples)
+        counts = _sample_count_columns(simulated.samples)
         for name in simulated.custom_metrics:
             if not custom_checks.is_column_name(name):
                 raise ValueError(f"its {name!r} is no name of a column; allowed are names that can be printed")
@@ -124,8 +124,8 @@ class Campaign:
         return list(simulated.custom_metrics)
 
 
-def _sample_counts(samples: dict[str, Any]) -> dict[str, Any]:
-    """Return the numbers of samples by status, by column."""
+def _sample_count_columns(samples: dict[str, Any]) -> dict[str, Any]:
+    """Return the numbers of samples by column name, given the numbers by the status that the C code returned."""
     return {f"{run_tables.COUNT_PREFIX}{status}": count for status, count in samples.items()}
 
 
@@ -194,9 +194,9 @@ def missing_parts(parts: Iterable[Part], trials: int, shard: tuple[int, int] = (
     return [(first, count) for first, count in all_parts[number - 1 :: shards] if counts.get(first, 0) < count]
 
 
-def kept_parts(parts: Iterable[Part], wanted: Iterable[Block]) -> list[Part]:
-    """Return the parts on disk that are not among the wanted blocks, so that they are not simulated again."""
-    simulated_again = {first for first, _ in wanted}
+def kept_parts(parts: Iterable[Part], to_simulate: Iterable[Block]) -> list[Part]:
+    """Return the parts on disk that count as done, because they are not among the blocks that are simulated next."""
+    simulated_again = {first for first, _ in to_simulate}
     return [part for part in parts if part.first not in simulated_again]
 
 

@@ -117,11 +117,11 @@ def design(
 class _Limits:
     """Limits of a manoeuvre's rate, torque and wheel momentum, and the maps from body momentum to rate and wheels."""
 
-    torque: float  # largest torque about an axis [N m]
-    rate: float  # largest rate about an axis [rad/s]
+    torque: float  # largest allowed torque about an axis [N m]
+    rate: float  # largest allowed rate about an axis [rad/s]
     inertia_inverse: np.ndarray  # (m, m) map from momentum to rate
     allocation: np.ndarray  # (channels, m) torque of each channel for a unit torque about each axis
-    momentum: float  # largest momentum of each wheel [N m s], infinite without a limit
+    momentum: float  # largest allowed momentum of each wheel [N m s], infinite without a limit
 
     @staticmethod
     def from_scenario(loaded: Any, problem: Problem, rate: float, torque: float | None) -> "_Limits":

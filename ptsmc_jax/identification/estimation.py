@@ -31,7 +31,7 @@ MAX_STEPS = 40  # largest number of steps of a local search
 MAX_STEP_LENGTH = 3.0  # longest step of a local search, in sigmas of the prior
 NOISY_TOLERANCE = 0.3  # largest step that ends a search with noise on the acceleration, in sigmas of the estimate
 STEP_TOLERANCE = 1e-3  # largest step of a converged search, in sigmas of the estimate
-ACCELERATION_NOISES = (0.3, 0.03, 0.003, 0.0003)  # noise in a search, relative to the acceleration [s^0.5]
+ACCELERATION_NOISES = (0.3, 0.03, 0.003, 0.0003)  # noise in a search, relative to the usual acceleration [s^0.5]
 MAX_SCREENINGS = 4  # largest number of searches for outliers, each followed by a search for the parameters
 POOR_FIT = 1.5  # median normalised square of innovations above which a search begins with noise
 LAGS = 25  # number of lags of the autocorrelation
@@ -57,7 +57,7 @@ class Fit:
     innovations: Innovations  # arrays (rows - 1, components)
     track: Track
     adjusted: Innovations | None = None
-    distance: float = 0.0  # distance of the most likely parameters from the estimates, RMS in sigmas
+    distance: float = 0.0  # distance of this log's own most likely parameters from the estimates, RMS in sigmas
 
     @property
     def whitened(self) -> np.ndarray:
@@ -342,7 +342,7 @@ class Search:
 
         Args:
             z: starting point.
-            acceleration: usual acceleration in the logs [rad/s^2]; 0: no noise is added.
+            acceleration: usual acceleration in the logs, which scales the noise [rad/s^2]; 0: no noise is added.
         """
         if acceleration > 0.0 and max(self._relative_median(self.innovations(z, log)) for log in self.logs) > POOR_FIT:
             for factor in ACCELERATION_NOISES:

@@ -153,10 +153,12 @@ def acting_command(model: Model, rows: Rows, wheel_inertia: float | None) -> Arr
     integral = jnp.cumsum(rows.command * rows.dt[:, None], axis=0)
     integral = jnp.concatenate([jnp.zeros((1, rows.command.shape[1])), integral[:-1]])
 
-    def integral_at(time: Array) -> Array:
+    def integrate_delayed_command(time: Array) -> Array:
+        """Return the integral of the delayed command from the first row to these times, (times, channels)."""
         return jnp.stack([jnp.interp(time - model.delay, rows.t, column) for column in integral.T], axis=1)
 
-    mean = (integral_at(rows.t + rows.dt) - integral_at(rows.t)) / jnp.where(rows.dt > 0.0, rows.dt, jnp.inf)[:, None]
+    impulse = integrate_delayed_command(rows.t + rows.dt) - integrate_delayed_command(rows.t)
+    mean = impulse / jnp.where(rows.dt > 0.0, rows.dt, jnp.inf)[:, None]
     return jnp.where(model.delay > 0.0, mean, rows.command)
 
 

@@ -265,13 +265,16 @@ ParameterMaker = Callable[[Model], tuple[Model, Parameter]]
 
 
 def _parameter_makers(
-    scenario: Any, model: Model, logs: Sequence[Measurements], interval: float, prior: Any
+    scenario: Any, model: Model, logs: Sequence[Measurements], log_interval: float, prior: Any
 ) -> dict[str, ParameterMaker]:
-    """Return the functions that add each possible parameter to a model, by name; see `parameter_maker`."""
+    """Return the functions that add each possible parameter to a model, by name; see `parameter_maker`.
+
+    log_interval: time between two rows of the first log [s], the default prior 1 sigma of a delay.
+    """
     plant, actuators = model.plant, model.actuators
     axes = np.eye(plant.inputs) if actuators.wheels is None else np.asarray(actuators.wheels.axes)
     torque = max(float(np.sqrt(np.mean(log.command**2))) for log in logs) or 1.0
-    default_sigma = {**USUAL_SIGMA, "delay": interval, "disturbance_bias": 0.1 * torque}
+    default_sigma = {**USUAL_SIGMA, "delay": log_interval, "disturbance_bias": 0.1 * torque}
 
     def prior_sigma(name: str, count: int) -> tuple[np.ndarray, bool]:
         """Return the 1 sigma of each number, (count,), and whether [dispersion] gives it."""

@@ -45,6 +45,7 @@ def _error_angle(error: Number) -> Number:
 
 
 def _error_angles(bounds: Interval) -> Interval:
+    """Return an interval of the window error |v| as angles [arcsec]."""
     if bounds is None:
         return None
     low, high = (ARCSEC * pointing_angle(bounds)).tolist()

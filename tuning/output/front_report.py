@@ -55,7 +55,7 @@ def result_table(front: Front) -> Table:
 
 
 def gain_table(front: Front) -> Table:
-    """Return the table of gains."""
+    """Return the table of gains, with a row for each point of the Pareto front and for each set of reference gains."""
     from ptsmc_jax.simulation.gains import base
 
     rows = _labelled_points(front)

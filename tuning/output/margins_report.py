@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from ptsmc_jax.simulation.catalogues import MARGINS
 from tuning.output.formats import format_number
 from tuning.output.report import Report, Section, Table
-from tuning.output.summaries import Left, LimitCycle, Margins, Numbers
+from tuning.output.summaries import LimitCycle, Margins, Numbers, SmallestMargins
 
 USUAL_MARGINS = {"gain_margin": 6.0, "phase_margin": 30.0}  # usual requirements [dB, deg]
 PHASES = {"hold": "hold phase", "before": "approach phase"}
@@ -104,7 +104,7 @@ def _format_times(times: list[float]) -> str:
     return f"{span} s to go"
 
 
-def tuned_margin_lines(margins: Mapping[str, Left] | None, *, required: bool) -> Iterator[str]:
+def tuned_margin_lines(margins: Mapping[str, SmallestMargins] | None, *, required: bool) -> Iterator[str]:
     """Return the margins of tuned gains, and a warning if they are smaller than usual.
 
     Args:

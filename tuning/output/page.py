@@ -161,7 +161,7 @@ def _simulate_report(result: Result) -> Report:
     columns = page_charts.read_trajectory(result.folder / "trajectory.csv")
     law = result.scenario["controller"]
     marks = {"t_f": law["t_f"], **({"t_f - delta": law["t_f"] - law["delta"]} if "delta" in law else {})}
-    if "delta" in law and law["delta"] < 0.05 * columns["t"][-1]:  # the labels would overlap
+    if "delta" in law and law["delta"] < 0.05 * columns["t"][-1]:  # the labels of t_f - delta and t_f would overlap
         del marks["t_f - delta"]
     spacecraft = result.plant == "spacecraft"
     caption = "Drag to zoom, double-click to see all; the dotted lines are the hand-over and t_f."

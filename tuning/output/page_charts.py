@@ -178,7 +178,7 @@ def laws(
     marks: Mapping[str, float],
     logarithmic: bool,
 ) -> Chart:
-    """Return the chart of numbers of several laws, one below the other.
+    """Return the chart of numbers of several laws with their intervals, one law below the other.
 
     Args:
         names: names of the laws.

@@ -28,7 +28,7 @@ def build(summary: Run, plant: str) -> Report:
 
 
 def _summary_lines(summary: Run, plant: str) -> Iterator[str]:
-    """Return the ratio to the lower bound, the reason of a failure, and the status of the samples of C code."""
+    """Return the ratio of window error to lower bound, the reason of a failure, and the sample statuses of C code."""
     yield from bound_lines(summary.metrics.get("window_error"), summary.lower_bound, plant)
     if summary.reason:
         when = "" if summary.bad_time is None else f", at {summary.bad_time:.4g} s"

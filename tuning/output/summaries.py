@@ -138,7 +138,7 @@ class LimitCycle(msgspec.Struct, frozen=True):
     periods: float
 
 
-class Left(msgspec.Struct, frozen=True):
+class SmallestMargins(msgspec.Struct, frozen=True):
     """The smallest margins of a phase of the nominal loop; None: unlimited."""
 
     stable: bool
@@ -158,7 +158,7 @@ class Trust(msgspec.Struct, frozen=True):
     """The diagnostics of a tuning result."""
 
     influence: dict[str, str]
-    margins: dict[str, Left] | None
+    margins: dict[str, SmallestMargins] | None
     gradient_error: Numbers | None
 
 
@@ -232,7 +232,7 @@ class Law(msgspec.Struct, frozen=True, kw_only=True):
     unsettled: int
     settling_time: Numbers | None
     settling_near_far: tuple[Number, Number] | None
-    margins: dict[str, Left] | None
+    margins: dict[str, SmallestMargins] | None
     model_errors: dict[str, Changed]
     verdicts: list[Entry]
 

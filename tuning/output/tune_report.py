@@ -91,7 +91,7 @@ def accuracy_lines(summary: Tune) -> Iterator[str]:
     """Return lines that compare the error with the lower bound and with the error of the published gains."""
     held_out, plant = summary.held_out, summary.plant
 
-    def format_rms(value: float) -> str:
+    def format_rms_error(value: float) -> str:
         return format_error(value, plant)
 
     if summary.status == "interrupted":
@@ -105,11 +105,11 @@ def accuracy_lines(summary: Tune) -> Iterator[str]:
         error_ratio = ratio_to_bound(on_held_out.rms, held_out.lower_bound)
         lower_bound = format_error(held_out.lower_bound, plant)
         bound = "" if error_ratio is None else f", {format_ratio(error_ratio)} times the lower bound of {lower_bound}"
-        spread = format_interval(on_held_out.rms_interval, format_rms)
-        yield f"held-out trials: {format_rms(on_held_out.rms)}{spread}{bound}"
+        spread = format_interval(on_held_out.rms_interval, format_rms_error)
+        yield f"held-out trials: {format_rms_error(on_held_out.rms)}{spread}{bound}"
     if on_training is not None and on_training.rms is not None:
-        spread = format_interval(on_training.rms_interval, format_rms)
-        yield f"training trials: {format_rms(on_training.rms)}{spread}"
+        spread = format_interval(on_training.rms_interval, format_rms_error)
+        yield f"training trials: {format_rms_error(on_training.rms)}{spread}"
     yield from _published_comparison(summary)
     if summary.gains:
         yield f"tuned gains: {', '.join(f'{name} {value:.6g}' for name, value in summary.gains.items())}"

@@ -29,8 +29,8 @@ class ShortestTime:
     """Shortest t_f [s] that keeps the largest input of all trials, or of a fraction of them, within the limit."""
 
     limit: float
-    theory: float | None  # from the exact motions; None: no t_f keeps the limit
-    simulated: float | None  # found by simulation; None: not found
+    theory: float | None  # shortest t_f from the exact motions [s]; None: no t_f keeps the limit
+    simulated: float | None  # shortest t_f found by simulation [s]; None: not found
     trials: int
     quantile: float | None = None  # fraction of trials that must keep the limit; None: all trials
     unit: str | None = None  # unit of the limit
@@ -65,7 +65,7 @@ def shortest_time(loaded: Scenario, requirement: Requirement, seed: int, trials:
     if theory is None:
         return ShortestTime(limit, None, None, *context)
 
-    def search_by_simulation(ready: scenario.Study, longest: float) -> float | None:
+    def search_shortest_t_f(ready: scenario.Study, longest: float) -> float | None:
         def simulate_peak(t_f: float) -> float:
             parts = with_gains(ready.parts, {"t_f": t_f})
             result = montecarlo.run(parts, ready.dispersion, seed, trials)
@@ -75,12 +75,12 @@ def shortest_time(loaded: Scenario, requirement: Requirement, seed: int, trials:
         return _shortest_t_f(simulate_peak, limit, theory, max(lowest, 0.2 * theory), longest, TOLERANCE, MOST_BATCHES)
 
     # first on the clock of the scenario, whose program is compiled anyway, and on a longer clock only if t_f is longer
-    shortest = search_by_simulation(ready, present_t_f) if theory <= present_t_f else None
+    shortest = search_shortest_t_f(ready, present_t_f) if theory <= present_t_f else None
     if shortest is None:
         longest = max(1.5 * theory, present_t_f)
         with contextlib.suppress(ScenarioError):  # for example a reference that reaches the law's singularity later
             longer_study = scenario.study(in_scenario(loaded, {"t_f": longest}))
-            shortest = search_by_simulation(longer_study, longest)
+            shortest = search_shortest_t_f(longer_study, longest)
     return ShortestTime(limit, theory, shortest, *context)
 
 

@@ -183,7 +183,7 @@ def _judge_points(rules: Rules, gains: jax.Array, metrics: jax.Array, status: ja
 def _judge_gradients(
     rules: Rules, gains: jax.Array, directions: jax.Array, metrics: jax.Array, status: jax.Array, derivatives: jax.Array
 ) -> dict[str, jax.Array]:
-    """Return F, constraints and objective with gradients, by the chain rule from gradients of gains and metrics."""
+    """Return F, which is minimised, constraints and objective; gradients of F and constraints by the chain rule."""
 
     def judge_point(
         gains: jax.Array, directions: jax.Array, metrics: jax.Array, status: jax.Array, derivatives: jax.Array

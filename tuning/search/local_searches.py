@@ -49,7 +49,7 @@ FOLLOWED_STARTS = 3  # number of explored starting points that continue with all
 SAME_F = 1e-4  # points with a smaller difference of F, 0.01 % of the objective, are equally good
 FINAL_TOLERANCE = 1e-2 * F_TOLERANCE  # for the last local search, from the best point
 CONFLICTING = 0.1  # limits whose excess is within this fraction of the largest excess count as conflicting
-HAND_OVER_ATTEMPTS = 3  # largest number of attempts with other hand-over times
+HAND_OVER_ATTEMPTS = 3  # largest number of attempts to improve the best point by another hand-over time t_f - delta
 SOBOL_POINTS = 512  # Sobol points of a search without gradients
 
 
@@ -199,7 +199,7 @@ class LocalSearches:
         first_steps, more_steps = max(2, self._steps // 4), max(2, self._steps // 2)
         contenders = dict(enumerate(first, number))
         stages = ((len(contenders), first_steps), (max(FOLLOWED_STARTS, len(contenders) // 2), more_steps))
-        ranked = self._successive_halving(problem, contenders, stages, "searching", scales=(CAREFUL, BOLD))
+        ranked = self._successive_halving(problem, contenders, stages, "searching", scalings=(CAREFUL, BOLD))
         return {k: self._ends[k].normalised for k in ranked[:FOLLOWED_STARTS]} or {number: first[0]}
 
     def search_locally(self, problem: Problem, starts: Mapping[int, np.ndarray]) -> None:
@@ -222,7 +222,7 @@ class LocalSearches:
         stages: Sequence[tuple[int, int]],
         step_name: str,
         *,
-        scales: Sequence[float] = (CAREFUL,),
+        scalings: Sequence[float] = (CAREFUL,),
         replace_best: bool = False,
     ) -> list[int]:
         """Run successive halving and return the numbers of the local searches, the best first.
@@ -232,11 +232,11 @@ class LocalSearches:
             starts: (gains,) normalised gains of each starting point, by number of the local search.
             stages: for each stage, the number of local searches that continue, and the total steps of each.
             step_name: name of the step in progress reports.
-            scales: scalings of the variables, which the local searches use in turn.
+            scalings: scalings of the variables, `BOLD` or `CAREFUL`, which the local searches use in turn.
             replace_best: replace the best point so far by the first result, because the problem has changed.
         """
         contenders = {
-            k: _Contender(Start(normalised, scales[k % len(scales)]), list(self._history.get(k, ())))
+            k: _Contender(Start(normalised, scalings[k % len(scalings)]), list(self._history.get(k, ())))
             for k, normalised in starts.items()
         }
         ranked = list(starts)
@@ -366,10 +366,9 @@ class LocalSearches:
             self._update_best(best, tightened, 0, replace_best=best.infeasibility <= self.best.infeasibility)
 
     def find_conflicts(self, problem: Problem) -> dict[str, float | None]:
-        """Return the limits that the best compromise exceeds most, and the smallest ratio that each can reach alone.
+        """Return each limit that the best point exceeds most, with its smallest ratio if all other limits are kept.
 
-        The ratio is metric / limit, with every other limit kept to 0.1 %. It is None if the other limits cannot be
-        kept.
+        The ratio is metric / limit. Every other limit is kept to 0.1 %. The ratio is None if that is impossible.
         """
         tightened, smallest_ratios = self.tightened(problem), dict[str, float | None]()
         measure = partial(self._evaluate.measure_with_gradients, tightened)

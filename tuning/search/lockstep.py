@@ -22,9 +22,10 @@ class _Task:
         self._answer: Any = None
 
     def start(self) -> None:
-        threading.Thread(target=self._run, daemon=True).start()
+        threading.Thread(target=self._run_work, daemon=True).start()
 
-    def _run(self) -> None:
+    def _run_work(self) -> None:
+        """Run the work of this task in its thread, record an error, and notify that the task has ended."""
         try:
             self._work(self._ask)
         except BaseException as error:

@@ -257,6 +257,7 @@ def measure(problem: Problem, gains: Float[Array, " gains"]) -> tuple[Array, Arr
     parts, names = with_gains(problem.parts, dict(zip(problem.names, gains, strict=True))), needed_metrics(problem)
 
     def simulate_trial(trial_and_coordinates: tuple[Array, Coordinates]) -> tuple[Array, Array]:
+        """Return the metrics and status of a trial, given its number and the random numbers of its dispersions."""
         trial, coordinates = trial_and_coordinates
         metrics, status, *_ = montecarlo.one(parts, problem.dispersion, problem.seed, trial, coordinates)
         return jnp.stack([getattr(metrics, name) for name in names]), status

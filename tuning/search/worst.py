@@ -27,7 +27,7 @@ ASCENTS = 8  # number of hardest screened trials where an ascent starts
 STEPS, RATE, LAST_RATE = 30, 0.1, 0.01  # number of steps of the ascent; first and last learning rate
 PROBABILITY = 0.9999  # probability content of the searched region of a normal dispersion
 MEAN_VALUE_STEPS = 3  # steps of the advanced mean value method for normal dispersions, after the ascent
-LIMIT_TOLERANCE = 1e-3  # a worst case may exceed a limit by this fraction
+LIMIT_TOLERANCE = 1e-3  # the metric of a worst case may exceed its limit by this fraction
 
 _ADAM = optax.adam(optax.cosine_decay_schedule(RATE, STEPS, LAST_RATE / RATE), b2=0.9)
 

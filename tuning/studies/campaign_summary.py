@@ -296,7 +296,7 @@ def write_summary(folder: Folder, summary: dict[str, Any], figures: bool) -> Non
         figures: write the figures too.
     """
 
-    def write_files(staging: Path) -> None:
+    def write_summary_and_figures(staging: Path) -> None:
         store.write_json(staging / store.SUMMARY, summary)
         if figures:
             from ptsmc_jax.figures import style  # the import takes half a second, which only figures need
@@ -304,7 +304,7 @@ def write_summary(folder: Folder, summary: dict[str, Any], figures: bool) -> Non
 
             style.save(campaign_figures.build(folder, summary), staging / "figures")
 
-    store.write_folder(folder.path, write_files)
+    store.write_folder(folder.path, write_summary_and_figures)
 
 
 def worst_trials(folder: Folder, by: str, count: int) -> pl.DataFrame:

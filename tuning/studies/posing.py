@@ -152,13 +152,14 @@ def tuning_reach(scenario: Scenario, table: tables.Tune, **overrides: float) -> 
     """
     scenario_reach = reach_of(scenario)
 
-    def range_of_gain(name: str, lower: float, upper: float | None = None) -> tuple[float, float]:
-        low, high = table.bounds.get(name, (lower, lower))
-        return min(low, lower), max(high, lower if upper is None else upper)
+    def covering_range(name: str, value: float, largest: float | None = None) -> tuple[float, float]:
+        """Return the smallest range that includes the bounds of a gain and its values in the scenario."""
+        low, high = table.bounds.get(name, (value, value))
+        return min(low, value), max(high, value if largest is None else largest)
 
-    smallest_delta, delta = range_of_gain("delta", scenario_reach.delta)
-    smallest_t_f, t_f = range_of_gain("t_f", scenario_reach.t_f)
-    gain, largest_gain = range_of_gain("observer_gain", scenario_reach.gain, scenario_reach.largest_gain)
+    smallest_delta, delta = covering_range("delta", scenario_reach.delta)
+    smallest_t_f, t_f = covering_range("t_f", scenario_reach.t_f)
+    gain, largest_gain = covering_range("observer_gain", scenario_reach.gain, scenario_reach.largest_gain)
     covered = dataclasses.replace(
         scenario_reach,
         smallest_t_f=smallest_t_f,
@@ -167,9 +168,9 @@ def tuning_reach(scenario: Scenario, table: tables.Tune, **overrides: float) -> 
         smallest_delta=smallest_delta,
         gain=gain,
         largest_gain=largest_gain,
-        k1=range_of_gain("k1", scenario_reach.k1)[1],
-        sign_width=range_of_gain("sign_width", scenario_reach.sign_width)[0],
-        surface_rate=range_of_gain("surface_rate", scenario_reach.surface_rate)[1],
+        k1=covering_range("k1", scenario_reach.k1)[1],
+        sign_width=covering_range("sign_width", scenario_reach.sign_width)[0],
+        surface_rate=covering_range("surface_rate", scenario_reach.surface_rate)[1],
     )
     return dataclasses.replace(covered, **overrides)
 

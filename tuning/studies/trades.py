@@ -345,7 +345,7 @@ def build(against: str, scenario: Scenario, points: int | None, values: tuple[fl
 
 
 def limits_between(lowest: float, highest: float, points: int, scenario_limit: float | None) -> tuple[np.ndarray, int]:
-    """Return limits on the peak torque that are evenly spaced in their logarithms.
+    """Return limits on the peak torque, evenly spaced in their logarithms, and the index of the scenario's limit.
 
     Args:
         lowest: first limit [N m].

@@ -32,7 +32,7 @@ def statistics(trials: Trials, kind: str) -> dict[str, Any]:
         values = getattr(trials.metrics, name)[trials.finished]
         known_values = values[np.isfinite(values)]
         if known_values.size == 0:
-            if entry.table is None:  # the scenario must have the table that a metric needs
+            if entry.table is None:  # a metric that needs a table of the scenario is left out, since it may be absent
                 results[name] = None
             continue
         results[name] = {
