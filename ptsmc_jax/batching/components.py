@@ -165,6 +165,7 @@ class ComponentRules:
         simplify = _ZERO_RULES.get(name) if _has_tangent(values) else None
 
         def apply_to_component(*operands: Any) -> Any:
+            """Return a scalar component of the result of the primitive, from the same component of each operand."""
             result = None if simplify is None else simplify(*operands)
             return operation(*self.broadcast(operands)) if result is None else result
 

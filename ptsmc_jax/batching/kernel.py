@@ -30,7 +30,7 @@ STACK_LIMIT = 256  # length of the longest loop without carries that is unrolled
 MAX_COMPONENTS = 1024  # entries of the largest array; all arrays are split into components
 
 _CUSTOM_CALLS = ("custom_jvp_call", "custom_vjp_call")  # inlined: derivatives are taken before the kernel is built
-# primitives that `components` has a rule for, and Triton has no lowering for
+# primitives that a compiled kernel refuses: Triton has no lowering for them, although `components` has a rule
 _NOT_LOWERED = set(
     """complex conj copy copy_p digamma eq_to erf erf_inv erfc imag le_to lgamma lt_to real reduce_precision
     round""".split()

@@ -375,12 +375,13 @@ class _Interpreter:
         def mask(selected: Array, leaf: Array) -> Array:
             return jnp.where(selected, leaf, lax.stop_gradient(leaf))
 
-        def stop_gradient(value: BatchedArray, variable: Any) -> BatchedArray:
+        def stop_gradient_if_unselected(value: BatchedArray, variable: Any) -> BatchedArray:
+            """Return an operand of the branch without gradient in the trials that do not select it."""
             if not jnp.issubdtype(variable.aval.dtype, jnp.inexact):
                 return value
             return self._map_leaves(mask, selected, self._align_one(value, value.axes | TRIAL))
 
-        return list(map(stop_gradient, operands, eqn.invars[1:]))
+        return list(map(stop_gradient_if_unselected, operands, eqn.invars[1:]))
 
     def custom_jvp(self, eqn: Any, values: list[BatchedArray]) -> list[BatchedArray]:
         """Return the results of a function with a custom derivative rule (`jax.custom_jvp`), and preserve the rule."""
@@ -401,6 +402,7 @@ class _Interpreter:
 
         @function.defjvp
         def derivative(primals: tuple, tangents: tuple) -> tuple:
+            """Return batched results and tangents of `function`, by the custom rule of the equation."""
             traced = jax.make_jaxpr(value_and_tangent)(avals, [avals[k] for k in inexact])
             results = self.evaluate_inside(traced, [*primals[0], *(tangents[0][k] for k in inexact)])
             return self.align(results[: len(axes)], axes), self.align(results[len(axes) :], axes)

@@ -28,7 +28,7 @@ NEVER_BATCHED = frozenset(
 
 
 def vmap(function: Callable) -> Callable:
-    """Return `jax.vmap(function)` over the first axis of all arguments, safe for functions that call LAPACK."""
+    """Return `jax.vmap(function)` over the first axis of all arguments, without deadlocks of its LAPACK calls."""
 
     def batched_function(*args: Any) -> Any:
         leaves = jax.tree.leaves(args)

@@ -44,7 +44,7 @@ class AppliedTorque(NamedTuple):
 
     mean: Array  # (m,) [N m]
     slope: Array | None  # (m,) rate of change [N m/s]; None if the torque is held
-    stored: Array | None  # (m,) momentum A h at the start [N m s]; None without wheels
+    stored: Array | None  # (m,) momentum A h of the wheels at the start of the time dt [N m s]; None without wheels
     dt: Array  # [s]
 
     def torque_at(self, s: Scalar, w: Vector) -> Vector:

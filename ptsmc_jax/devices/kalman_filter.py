@@ -34,7 +34,8 @@ from ptsmc_jax.devices.attitude_sensors import AttitudeSensor
 from ptsmc_jax.numerics import attitude, guards
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 
-# largest number of control periods of a cycle; of a longer cycle `KalmanFilter.first` has only this many
+# largest number of control periods in a cycle of the sensors' sample times; of a longer cycle, `KalmanFilter.first` has
+# the factors of the covariance for only this many periods
 LONGEST_CYCLE = 1000
 DOUBLINGS = 60  # largest number of doublings of the number of cycles until the steady state
 # 1 sigma of the attitude at switch-on [rad], because the body may turn before the first reading arrives
@@ -258,7 +259,7 @@ class KalmanFilter:
 
 
 def kalman_filter(
-    sensors: Sequence[AttitudeSensor], rate_noise: Any, drift: Any, rate_bias: Any, period: float
+    sensors: Sequence[AttitudeSensor], rate_noise: Any, bias_drift: Any, switch_on_bias: Any, period: float
 ) -> KalmanFilter:
     """Return a filter that starts in its steady state at rest.
 
@@ -267,8 +268,8 @@ def kalman_filter(
     Args:
         sensors: attitude sensors.
         rate_noise: 1 sigma of a gyro sample (3,) [rad/s].
-        drift: 1 sigma of the change of the bias per second of a period (3,) [rad/s^2].
-        rate_bias: 1 sigma of the gyro bias when the gyro is switched on (3,) [rad/s].
+        bias_drift: 1 sigma of the change of the bias per second of a period (3,) [rad/s^2].
+        switch_on_bias: 1 sigma of the gyro bias when the gyro is switched on (3,) [rad/s].
         period: control period [s].
 
     Raises:
@@ -276,7 +277,7 @@ def kalman_filter(
     """
     if any(np.any(np.asarray(sensor.noise) <= 0.0) for sensor in sensors):
         raise ValueError("every attitude sensor must have noise greater than 0")
-    each = (rate_noise, drift, rate_bias)
+    each = (rate_noise, bias_drift, switch_on_bias)
     gyro, change, bias = (jnp.broadcast_to(jnp.asarray(v, float), (3,)) for v in each)
     kalman = KalmanFilter(tuple(sensors), gyro, change, bias, jnp.asarray(float(period)), jnp.zeros((1, 6, 6)))
     return replace(kalman, first=jnp.asarray(_steady_state(kalman)))

@@ -34,12 +34,12 @@ def pattern(ratio: float) -> tuple[int, int]:
     return fraction.numerator, fraction.denominator
 
 
-@programs.jit(static_argnames="repeating")
+@programs.jit(static_argnames="periods_and_samples")
 def filter_between_samples(
     bandwidth: Any, attitude_noise: Any, rate_noise: Any, bias_walk: Any, period: Any, interval: Any,
-    repeating: tuple[int, int],
+    periods_and_samples: tuple[int, int],
 ) -> AttitudeFilter:  # fmt: skip
-    """Return the `attitude_filter` for a star tracker with its own clock.
+    """Return the `attitude_filter` for a star tracker with its own sample interval, not at control samples.
 
     Args:
         bandwidth: bandwidth of the filter [rad/s].
@@ -48,10 +48,10 @@ def filter_between_samples(
         bias_walk: random walk of the gyro's bias [rad/s/sqrt(s)].
         period: control period [s].
         interval: time between star tracker samples [s].
-        repeating: control periods and star tracker samples after which the times repeat, see `pattern`.
+        periods_and_samples: control periods and star tracker samples after which the times repeat, see `pattern`.
     """
     k1, k2 = filter_gains(bandwidth, interval)
-    periods, samples = repeating
+    periods, samples = periods_and_samples
     count = np.arange(1, periods + 1)
     ages = count - (count * samples // periods) * (
         periods / samples

@@ -13,7 +13,7 @@ LARGEST_SHOWN = 40.0  # |L| is drawn from minus this value to this value [dB]
 
 
 def _decibels(values: np.ndarray) -> np.ndarray:
-    """Return sizes [dB]. A size of 0, as of a saturated command, becomes a number far below the axis."""
+    """Return magnitudes [dB]. Zero, as when a saturated command ignores the state, is put far below the axis."""
     return 20.0 * np.log10(np.maximum(np.abs(values), 1e-9))
 
 

@@ -101,6 +101,7 @@ class Terminal(ComparisonLaw):
     sign_width: Leaf = boundary_layer(1e-3)
 
     def acceleration(self, now: Sample, error: Vector, error_rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
+        """Return the commanded eps'' and the sliding variable s, (m,) each."""
         s = error + guards.signed_power(error_rate, self.p) / self.b
         equivalent = -self.b / self.p * guards.signed_power(error_rate, 2.0 - self.p) - self.k * s
         return equivalent - bound * guards.smooth_sign(s, self.sign_width), s

@@ -131,12 +131,12 @@ class AttitudeKinematics(Kinematics):
     def middle_angle(self, start: tuple[Any, Any], end: tuple[Any, Any], dt: Scalar) -> Scalar:
         """Return `angle` in the middle [rad], from the cubic Hermite polynomial of q_f* q; smooth at angle 0."""
 
-        def error_quaternion(x: AttitudeState, target: Target) -> tuple[Array, Array]:
+        def error_quaternion_and_rate(x: AttitudeState, target: Target) -> tuple[Array, Array]:
             rates = attitude.derivative(target.q, target.w), attitude.derivative(x.q, x.w)
             return jax.jvp(lambda q_f, q: attitude.multiply(attitude.conjugate(q_f), q), (target.q, x.q), rates)
 
         return attitude.rotation_angle(
-            integrators.hermite_middle(*error_quaternion(*start), *error_quaternion(*end), dt)
+            integrators.hermite_middle(*error_quaternion_and_rate(*start), *error_quaternion_and_rate(*end), dt)
         )
 
 

@@ -156,10 +156,10 @@ class PrescribedTimeLaw(Law):
 class SurfaceGains(NamedTuple):
     """Gains of the law in the present phase: s = c eps' + e eps, and eps'' = -a eps' - b s - switching term."""
 
-    c: Array  # [s] in the approach phase, [-] in the hold phase
-    e: Array  # [-] in the approach phase, [1/s] in the hold phase
-    a: Array  # [1/s]
-    b: Array  # [1/s^2] in the approach phase, [1/s] in the hold phase
+    c: Array  # factor of eps' in s: t_f - t [s] in the approach phase, 1 in the hold phase
+    e: Array  # factor of eps in s, [-] in the approach phase, [1/s] in the hold phase
+    a: Array  # factor of -eps' in eps'' [1/s]
+    b: Array  # factor of -s in eps'', [1/s^2] in the approach phase, [1/s] in the hold phase
 
 
 @pytree

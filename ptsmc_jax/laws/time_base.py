@@ -56,7 +56,7 @@ class TimeBase(ComparisonLaw):
     def profile(self, start: ProfileStart, t: Scalar) -> Profile:
         """Return the desired error at the time t [s] and its derivatives, for a profile that begins at `start`."""
 
-        def error(t: Scalar) -> Vector:
+        def desired_error(t: Scalar) -> Vector:
             x = jnp.minimum(t / self.t_f, 1.0)
             from_error = 1.0 + x**3 * (-10.0 + x * (15.0 - 6.0 * x))
             from_rate = x * (1.0 + x**2 * (-6.0 + x * (8.0 - 3.0 * x)))
@@ -64,7 +64,7 @@ class TimeBase(ComparisonLaw):
             return self.kinematics.from_straight_coordinates(straight)
 
         def rates(t: Scalar) -> tuple[Vector, Vector]:
-            return jax.jvp(error, (t,), (jnp.ones_like(t),))
+            return jax.jvp(desired_error, (t,), (jnp.ones_like(t),))
 
         (r, rate), (_, acceleration) = jax.jvp(rates, (t,), (jnp.ones_like(t),))
         return Profile(r, rate, acceleration)

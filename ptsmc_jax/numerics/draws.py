@@ -89,7 +89,7 @@ def threefry(key: Key, counter: tuple[Word, Word]) -> tuple[Word, Word]:
             y = ((y << r) | (y >> (32 - r))) ^ x
         x = x + schedule[(group + 1) % 3]
         y = y + schedule[(group + 2) % 3] + jnp.uint32(group + 1)
-    if jnp.result_type(float) != jnp.float64:  # uint64 does not exist without 64 bits
+    if jnp.result_type(float) != jnp.float64:  # JAX without 64 bits has no uint64 to pack the words
         return x, y
     # Both words are packed into one number for a moment. XLA then fuses all rounds into one kernel.
     both = (x.astype(jnp.uint64) << 32) | y.astype(jnp.uint64)

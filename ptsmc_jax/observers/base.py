@@ -165,6 +165,7 @@ class LinearObserver(Observer):
     linear: ClassVar[bool] = True
 
     def decay_matrix(self, t: Scalar, t_next: Scalar) -> Matrix:
+        """Return A = l J^-1 [1/s], which is constant over the step."""
         return self._constant_decay()
 
     def _constant_decay(self) -> Matrix:

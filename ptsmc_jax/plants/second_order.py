@@ -135,7 +135,7 @@ class HiddenSystem(System):
 
     @property
     def state_shapes(self) -> dict[str, tuple[int, ...]]:
-        """One array (2n + k,)."""
+        """One array (2n + k,): x_1, x_2 and the k hidden states z."""
         return {"": (2 * self.inputs + self.z0.shape[-1],)}
 
     def drift(self, t: Scalar, x: Float[Array, " whole"]) -> Float[Array, " n"]:

@@ -18,7 +18,7 @@ from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.numerics import guards
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree, vector
 
-# longest step before the hand-over, divided by the time to go; such steps change window_error by 5e-4
+# longest step before the hand-over, divided by the time to t_f; such steps change window_error by 0.05 % of its value
 LARGEST_STEP_FRACTION = 0.25
 
 

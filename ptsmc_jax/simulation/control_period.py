@@ -50,7 +50,7 @@ class State(NamedTuple):
 
 
 class Record(NamedTuple):
-    """The events of a control period, or of an integration step of the continuous loop."""
+    """Times, decision, torques and true states of a control period, or of a step of the continuous loop."""
 
     now: Ticks  # true times
     decision: Decision  # decision of the flight software; its target is the reference at the true time
@@ -159,7 +159,7 @@ def start(
         software: the flight software.
     """
     lengths, actuators, inputs = ticks.t_next - ticks.t, parts.actuators, parts.plant.inputs
-    # both matrices are computed outside the loop, by one compiled function
+    # one compiled function computes the observer matrices of a full and of the first period, outside the loop
     first_length = jnp.sum(jnp.where(ticks.partial, lengths, 0.0))
     matrices = jax.lax.map(parts.observer.update_matrix, jnp.stack([parts.period, first_length]))
     walk_key = None if parts.walk_rate is None else draws.stream(seed, trial, DISTURBANCE_WALK)

@@ -156,13 +156,13 @@ def gains_of(parts: Parts) -> dict[str, float]:
     return {name: value for name, value in gains.items() if not (axes_are_equal and name in axes)}
 
 
-def gain_of_each_axis(gains: Mapping[str, Any], present: list[Any]) -> list[Any] | None:
-    """Return the observer gain of every axis, or None if `gains` has no observer gain.
+def gain_of_each_axis(gains: Mapping[str, Any], current_gains: list[Any]) -> list[Any] | None:
+    """Return the new or else the current observer gain of every axis, or None if `gains` has no observer gain.
 
     Args:
         gains: new values by name.
-        present: present value of each axis, used for an axis without a new value.
+        current_gains: current observer gain of each axis, used for an axis without a new value.
     """
     if not any(base(name) == OBSERVER_GAIN for name in gains):
         return None
-    return [gains.get(f"{AXIS}{k + 1}", gains.get(OBSERVER_GAIN, value)) for k, value in enumerate(present)]
+    return [gains.get(f"{AXIS}{k + 1}", gains.get(OBSERVER_GAIN, value)) for k, value in enumerate(current_gains)]

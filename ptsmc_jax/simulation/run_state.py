@@ -142,7 +142,7 @@ def advance(run: Run, score: Score, before: State, after: State, record: Record)
 
 
 def history_row(run: Run, before: State, after: State, record: Record, tick: Tick | None = None) -> Log:
-    """Return the row of the history at the start of a control period or of a step of the continuous loop.
+    """Return the history row at the start of a control period or step; without `tick` it has no sensor readings.
 
     Args:
         run: constants of the run.
@@ -150,7 +150,7 @@ def history_row(run: Run, before: State, after: State, record: Record, tick: Tic
         after: state at its end.
         record: record of the period.
         tick: the period at its nominal times. It is None in the continuous loop, and with exported C, whose memory of
-            the sensors has another form. The row then has no readings.
+            the sensors has another form.
     """
     now, drive, decision, wheels = record.now, record.drive, record.decision, None
     if drive is not None and record.torques.wheel_torque is not None:

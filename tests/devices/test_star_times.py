@@ -136,7 +136,7 @@ NOISES = {"bandwidth": 0.15, "attitude_noise": 2e-5, "rate_noise": 2e-6, "bias_w
 
 @pytest.mark.parametrize("every", [1, 4])
 def test_filter_between_equals_attitude_filter_for_an_integer_ratio(every):
-    found = star_times.filter_between_samples(*NOISES.values(), interval=0.25 * every, repeating=(every, 1))
+    found = star_times.filter_between_samples(*NOISES.values(), interval=0.25 * every, periods_and_samples=(every, 1))
     known = attitude_filter.attitude_filter(*NOISES.values(), every)
     for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(known), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-20)

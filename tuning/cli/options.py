@@ -118,7 +118,7 @@ VALUES = {"torque": "--points", "t_f": "--times", "margins": "--limits"}  # opti
 
 
 def parse_traded_values(against: str, points: int | None, times: str | None, limits: str | None) -> tuple[float, ...]:
-    """Return the times of --times [s] or the limits of --limits [dB], empty without them.
+    """Return the times of --times [s] or the limits of --limits [dB], empty without them; --points is only checked.
 
     Raises:
         UsageError: an option does not belong to this quantity, or its values are not allowed.
