@@ -152,7 +152,7 @@ class _StoredArray(NamedTuple):
     table: Any = None
 
     def in_tables(self, tables: dict[str, Any]) -> "_StoredArray":
-        """Return the array in these tables, by dtype, of the direction that the kernel computes."""
+        """Return the array bound to the tables of each dtype, at the direction of `jvp` of this kernel instance."""
         start = np.int32(self.start)
         if self.stride:
             start = start + pl.program_id(1) * np.int32(self.stride)
@@ -222,21 +222,21 @@ class _Tables:
 def _load_rows(ref: Any, count: int) -> Sequence:
     """Return the first rows of a table."""
 
-    def step(k: Any, loaded: tuple) -> tuple:
+    def load_row(k: Any, loaded: tuple) -> tuple:
         row = ref[k, :]
         return tuple(jnp.where(k == np.int32(i), row, value) for i, value in enumerate(loaded))
 
     empty = jnp.zeros((ref.shape[1],), ref.dtype)
-    return lax.fori_loop(np.int32(0), np.int32(count), step, (empty,) * count)
+    return lax.fori_loop(np.int32(0), np.int32(count), load_row, (empty,) * count)
 
 
 def _store_rows(ref: Any, rows: Sequence) -> None:
     """Store the first rows of a table."""
 
-    def step(k: Any, _: None) -> None:
+    def store_row(k: Any, _: None) -> None:
         ref[k, :] = _select(k, *rows)
 
-    lax.fori_loop(np.int32(0), np.int32(len(rows)), step, None)
+    lax.fori_loop(np.int32(0), np.int32(len(rows)), store_row, None)
 
 
 def _select(k: Any, *values: Any) -> Any:

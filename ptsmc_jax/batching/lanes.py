@@ -93,15 +93,15 @@ def jvp(function: Callable, in_axes: Any = 0, *, kernel: bool = False) -> Callab
     def values_and_tangents(args: tuple, directions: tuple) -> tuple[Any, Any]:
         """Return the values of the function for all trials, and its derivatives along all directions."""
         trials, one_trial, values = _batched_arguments(args, in_axes)
-        active = [k for k, along in enumerate(directions) if along is not None]
+        active = [k for k, along in enumerate(directions) if along is not None]  # arguments with a direction
         if not active or len(directions) > len(args):
             raise ValueError(f"directions must be of some of the {len(args)} arguments, found {len(active)}")
 
         def value_and_tangent(one_trial: tuple, tangents: tuple) -> tuple[Any, Any]:
-            def apply_to_active(*replacements: Any) -> Any:
+            def call_with_active_arguments(*replacements: Any) -> Any:
                 return function(*(dict(enumerate(one_trial)) | dict(zip(active, replacements, strict=True))).values())
 
-            return jax.jvp(apply_to_active, tuple(one_trial[k] for k in active), tangents)
+            return jax.jvp(call_with_active_arguments, tuple(one_trial[k] for k in active), tangents)
 
         along = [jnp.asarray(leaf) for leaf in jax.tree.leaves(directions)]
         closed, out = jax.make_jaxpr(value_and_tangent, return_shape=True)(

@@ -105,7 +105,7 @@ def vector_rates(q: Quaternion, w: Vector, w_dot: Vector) -> tuple[Vector, Vecto
 
 @jax.jit
 def from_vector_part(v: Vector, side: Float[Array, ""]) -> tuple[Quaternion, Float[Array, ""]]:
-    """Return the unit quaternion with the vector part v [-] whose scalar part has the sign of `side`.
+    """Return the unit quaternion with vector part v [-] and a scalar part with the sign of `side`, and 1 - |v|^2.
 
     Args:
         v: vector part [-], |v| < 1. If |v| >= 1 no such quaternion exists, and the scalar part is set to +-1e-6.

@@ -59,12 +59,12 @@ def smallest_eigenvalue(a: Float[Array, "n n"]) -> Float[Array, ""]:
     Unlike the closed form for 3 x 3 matrices, the method is accurate for equal eigenvalues.
     """
 
-    def sweep(_: Array | int, a: Array) -> Array:  # an int under `jax.disable_jit`
+    def rotate_all_pairs(_: Array | int, a: Array) -> Array:  # the index is an int under `jax.disable_jit`
         for p, q in combinations(range(a.shape[0]), 2):
             a = _rotate_pair(a, p, q)
         return a
 
-    return jnp.min(jnp.diagonal(jax.lax.fori_loop(0, SWEEPS, sweep, a)))
+    return jnp.min(jnp.diagonal(jax.lax.fori_loop(0, SWEEPS, rotate_all_pairs, a)))
 
 
 def _rotate_pair(a: Array, p: int, q: int) -> Array:

@@ -73,7 +73,7 @@ def mean_bound(fractions: np.ndarray, confidence: float) -> float:
     low = float(fractions.min())
     if low == 1.0:
         return 1.0
-    # The numbers are shifted and scaled, so that 0 and 1 are among them. The quantile of a weighted mean scales too.
+    # Shift and scale the numbers to a smallest of 0 and a largest of 1. The quantile is scaled back in the result.
     x, counts = np.unique(np.append((fractions - low) / (1.0 - low), 1.0), return_counts=True)
     if x.size == 2:
         return low + (1.0 - low) * (1.0 - fraction_bound(int(counts[0]), fractions.size, confidence))
