@@ -17,7 +17,7 @@ HELPER_FOLDERS = ("numerics/", "onboard/")  # folders whose functions get no hea
 
 
 class Section(NamedTuple):
-    """A function of the source."""
+    """A Python function whose equations form a section of the generated C, under a heading."""
 
     name: str
     path: str  # path of its file for a heading

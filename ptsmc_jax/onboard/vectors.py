@@ -49,7 +49,7 @@ class Samples(NamedTuple):
     wheel_torque: Array | None  # torque of each wheel [N m].
     limited: Array  # bool: whether a limit reduces the command.
     singularity_distance: Array  # distance to the singularity, divided by `singularity_distance_unit` [-].
-    singularity_distance_unit: Array  # unit of `singularity_distance`.
+    singularity_distance_unit: Array  # divisor of the distance to the law's singularity, constant in a run.
 
 
 def simulate(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
@@ -66,7 +66,8 @@ def simulate(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Sam
     law, sensors, wheels = parts.controller, parts.sensors, parts.actuators.wheels
     vehicle, first = start(parts, ticks, parts.aligned_initial, seed, trial)
 
-    def step(carry: tuple[State, Array], tick: Tick) -> tuple[tuple[State, Array], Samples]:
+    def simulate_period(carry: tuple[State, Array], tick: Tick) -> tuple[tuple[State, Array], Samples]:
+        """Simulate a control period. The carry is the loop's state and `singularity_distance_unit`, NaN at first."""
         state, scale = carry
         after, record = control_period(vehicle, state, tick)
         now, drive, computer = record.now, record.drive, after.computer
@@ -91,7 +92,7 @@ def simulate(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Sam
         )  # fmt: skip
         return (after, scale), row
 
-    return stacking.scan(step, (first, jnp.full_like(parts.t_end, jnp.nan)), schedule(ticks))[1]
+    return stacking.scan(simulate_period, (first, jnp.full_like(parts.t_end, jnp.nan)), schedule(ticks))[1]
 
 
 @programs.jit(compiler_options=programs.FAST_COMPILE)

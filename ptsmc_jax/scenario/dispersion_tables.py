@@ -269,7 +269,7 @@ class Interval(Table, frozen=True):
 
 
 class Outage(Interval, frozen=True):
-    """Begins at a uniform time between two times."""
+    """No samples for `duration`, starting at a uniform time between `earliest` and `latest`."""
 
     kind: Literal["uniform"] = "uniform"
     duration: Annotated[Positive | None, Meaning("duration; default: 10, scaled to the mission", "s")] = None

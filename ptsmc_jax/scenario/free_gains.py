@@ -225,7 +225,8 @@ def value_beyond_bound(scenario: Scenario, name: str, side: str) -> float | None
     else:
         value = low - 0.1 * (high - low) if side == "lower" else high + 0.1 * (high - low)
     value = max(value, 0.5 * (smallest + low)) if side == "lower" else min(value, 0.5 * (largest + high))
-    return None if value in (low, high) else float(f"{value:.4g}")  # None if the bound is the end of the allowed range
+    # the value equals the bound if the allowed range ends there
+    return None if value in (low, high) else float(f"{value:.4g}")
 
 
 def widen_bounds(

@@ -174,27 +174,28 @@ class MissionTable(ReferenceTable, frozen=True):
 class NadirTable(MissionTable, frozen=True):
     """Local vertical, local horizontal."""
 
-    def _orbit(self, scenario: Any) -> Any:
+    def _require_orbit(self, scenario: Any) -> Any:
+        """Return the orbit of the scenario; raise ScenarioError if there is no [orbit] table."""
         return missions.require_orbit(missions.from_scenario(scenario), 'reference.kind is "nadir"')
 
     def frequencies(self, scenario: Any) -> dict[str, float]:
-        return {"reference.kind": float(self._orbit(scenario).fastest())}
+        return {"reference.kind": float(self._require_orbit(scenario).fastest())}
 
     def check(self, scenario: Any) -> None:
         super().check(scenario)
-        self._orbit(scenario)
+        self._require_orbit(scenario)
 
     @property
     def mount(self) -> np.ndarray:
         return mission_references.nadir_mounting(self.primary_axis, self.secondary_axis)
 
     def build(self, scenario: Any) -> Any:
-        part = self.part_class(q=missions.IDENTITY, mount=self.mount, orbit=self._orbit(scenario))
+        part = self.part_class(q=missions.IDENTITY, mount=self.mount, orbit=self._require_orbit(scenario))
         return jax.tree.map(vector, part)
 
     def initial_reference_attitude(self, scenario: Any) -> np.ndarray:
         self.check(scenario)
-        axes = self._orbit(scenario)(np.zeros(()), np)
+        axes = self._require_orbit(scenario)(np.zeros(()), np)
         return missions.mounted_quaternion(np.stack([axes.radial, axes.along, axes.normal], axis=1), self.mount)
 
 

@@ -27,9 +27,9 @@ class PartTable(Table, frozen=True):
     prefix: ClassVar[str] = ""  # prefix of a key in the name of its gain, such as observer_ for observer_gain
     gains: ClassVar[tuple[str, ...]] = ()  # names of all gains that tuning can change
     usual: ClassVar[Mapping[str, str]] = {}  # by key: entry of `gain_bounds.BOUNDS`, for gains of the table itself
-    # Gains that are free by default. The second tuple is free in the sampled loop only: in the continuous loop a larger
-    # K1 and a thinner boundary layer cost only integration steps.
-    free_by_default: ClassVar[tuple[str, ...]] = ()
+    free_by_default: ClassVar[tuple[str, ...]] = ()  # names of gains that tuning changes by default
+    # Further such gains, in a sampled loop only. In a continuous loop, tuning would make K1 as large and the boundary
+    # layer as thin as allowed, because both cost only integration steps.
     free_if_sampled: ClassVar[tuple[str, ...]] = ()
     pickle_arguments: ClassVar[tuple] = ()  # a function that makes this type, and its arguments
 

@@ -230,7 +230,7 @@ class SystemScenario(StateScenario, frozen=True, kw_only=True):
                 "allowed is one without, and this one as plant.truth"
             )
         n, expected = system.inputs, len(self.plant.x0) // 2
-        if n != expected and key == "truth":  # x0 fits the system, which is loaded first
+        if n != expected and key == "truth":  # x0 fits plant.system, which is loaded before plant.truth
             shown = errors.brief(value)
             raise ScenarioError(
                 f"plant.truth is {shown}, which has n = {n}; allowed is n = {expected}, as plant.system"

@@ -23,7 +23,7 @@ class Noise(NamedTuple):
     """Standard deviations (1 sigma) caused by noise alone."""
 
     window_error: float  # RMS of the error's 2-norm over the window, in the unit of the metric.
-    torque: float  # Largest deviation of the command over time and axes [N m].
+    torque: float  # Largest 1 sigma of the command over time and axes [N m].
     s: float  # RMS deviation of the sliding variable over the window and its components.
     converged: bool = True  # Whether the iteration of `propagate_noise` converged within `ROUNDS` rounds.
 
@@ -58,7 +58,7 @@ def propagate_noise(parts: Parts) -> Noise:
     if scenario_width is None:
         return _propagate_covariance(parts, ticks, linearise())[0]
     unswitched = linearise(np.full(nonzero.size, FLAT_WIDTH))
-    sliding = _StateSpace(parts, ticks, unswitched).linear_map(unswitched.s_command, unswitched.s_direct)
+    sliding = _StateSpace(parts, ticks, unswitched).linear_map(unswitched.s_by_z, unswitched.s_by_seen)
     s_units = np.ones(nonzero.size)  # unit of s in each period, relative to its unit after the hand-over
     if parts.controller.prescribed:
         s_units[~ticks.hold] = float(parts.controller.layer_time) ** (parts.controller.order - 1)
@@ -200,7 +200,7 @@ def _propagate_covariance(
     """Propagate the covariance along the run; return the deviations and the equivalent sign widths (periods,)."""
     lengths = ticks.t_next - ticks.t
     state = _StateSpace(parts, ticks, linearised)
-    p, sliding = state.start(), state.linear_map(linearised.s_command, linearised.s_direct)
+    p, sliding = state.start(), state.linear_map(linearised.s_by_z, linearised.s_by_seen)
     command, transition = state.transition_maps(linearised.loop)
     sign_maps = (None, None) if sign is None else state.transition_maps(sign.loops)
     # columns of `squares`: error at the start of a period, error in its middle, mean square of the components of s

@@ -50,7 +50,7 @@ def switching_rate(parts: Parts) -> float:
 
 @programs.jit
 def _switching_rates(parts: Parts) -> tuple[Scalar, Scalar]:
-    """Return the factor of `switching_rate` for the largest K2, and for the K2 of a settled observer (at t_end)."""
+    """Return the factor of -tau^(n-1) sign(s) in s' for the largest K2, and for K2 at t_end (settled observer)."""
     law, bound = parts.controller, parts.observer.error_bound()
     run_states = visited_states(parts) if parts.plant.custom_functions else None
     largest, settled = (rates.switching_rate(law, k2, run_states) for k2 in (bound.largest, bound(parts.t_end)))

@@ -171,8 +171,8 @@ class LinearisedPeriod(NamedTuple):
     loop: Loop
     error: Array  # (m, x) Derivative of the error by the plant's local coordinates.
     error_rate: Array  # (m, x) Derivative of the error's rate by the same coordinates.
-    s_command: Array  # (components, n) Derivative of s by z.
-    s_direct: Array  # (components, k) Derivative of s by x_seen.
+    s_by_z: Array  # (components, n) Derivative of s by z, the state of the complete loop.
+    s_by_seen: Array  # (components, k) Derivative of s by x_seen, the plant state that sensors see.
 
 
 def linearise_period(parts: Parts, nominal_period: NominalRun, *, fractional_delays: bool = True) -> LinearisedPeriod:
@@ -216,14 +216,14 @@ def linearise_period(parts: Parts, nominal_period: NominalRun, *, fractional_del
         return jax.jacfwd(simulate_end, argnums=(0, 1))(u0, u0)
 
     jacobians = jax.jacfwd(simulate_period, argnums=(0, 1, 2, 3))(z0, seen0, u0, u0)
-    (a, seen, new, disturbed), (command, direct, *_), (s_command, s_direct, *_) = jacobians
+    (a, seen, new, disturbed), (command, direct, *_), (s_by_z, s_by_seen, *_) = jacobians
     if fractional_delays:
         old, new = lapack.vmap(command_jacobians)(jnp.asarray(NODES))
     else:
         old, new = jnp.zeros_like(new)[None], new[None]
     loop = Loop(a, seen, new, old, command, direct, disturbed, dt, delay=parts.actuators.delay)
     error, error_rate = jax.jacfwd(lambda offset: kinematics.errors(plant.retract(before.x, offset), target))(x0)
-    return LinearisedPeriod(loop, error, error_rate, s_command, s_direct)
+    return LinearisedPeriod(loop, error, error_rate, s_by_z, s_by_seen)
 
 
 def _with_exact_length(period: Period) -> Period:

@@ -319,7 +319,7 @@ class _RunJacobians(NamedTuple):
     transition: Array  # (periods, n, n) Derivative of the state at the end of the period by z.
     push: Array  # (periods, n, m) Derivative of the same state by p.
     error: Array  # (periods, 3 m, n) Derivative by z of the error at start, middle and end; middle is interpolated.
-    error_push: Array  # (periods, 3 m, m) Derivative of the same errors by p.
+    error_push: Array  # (periods, 3 m, m) Derivative of the error at start, middle and end by the torque p.
     early: Array  # (periods, k, n) Derivative by z of quantities measured within the period; k = 0 without them.
     early_push: Array  # (periods, k, m) Derivative of the same quantities by p.
     now: Array  # (periods, readings, n) Derivative by z of a sensor suite's readings at the start; else no rows.

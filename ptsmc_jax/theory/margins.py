@@ -91,11 +91,12 @@ def compute_in_batches(loops: Loop) -> Margins:
     """
     count = np.shape(loops.period)[0]
 
-    def compute_batch(k: int) -> Margins:
-        batch = np.resize(np.arange(k, min(k + LOOPS_PER_CALL, count)), LOOPS_PER_CALL)
+    def compute_batch(first: int) -> Margins:
+        """Return the margins of `LOOPS_PER_CALL` loops, from the index `first` on."""
+        batch = np.resize(np.arange(first, min(first + LOOPS_PER_CALL, count)), LOOPS_PER_CALL)
         return jax.tree.map(np.asarray, compute_each(jax.tree.map(lambda v: np.asarray(v)[batch], loops)))
 
-    batches = [compute_batch(k) for k in range(0, count, LOOPS_PER_CALL)]
+    batches = [compute_batch(first) for first in range(0, count, LOOPS_PER_CALL)]
     return jax.tree.map(lambda *blocks: np.concatenate(blocks)[:count], *batches)
 
 
