@@ -185,7 +185,7 @@ def use_wheel_speeds(model: Model, wheel_inertia: float | None) -> Model:
     actuators = replace(model.actuators, lag=None, rate_limit=None)
     axes = actuators.directions if actuators.directions is not None else actuators.wheels.axes  # pyright: ignore
     scale = jnp.ones(axes.shape[1]) if actuators.scale is None else actuators.scale
-    inertia = model.plant.inertia + wheel_inertia * (axes * scale) @ axes.T
+    inertia = model.plant.inertia + wheel_inertia * (axes * scale[None, :]) @ axes.T
     plant = model.plant.with_inertia(inertia, matrices.solve(inertia, jnp.eye(3)))
     return replace(model, plant=plant, actuators=actuators)
 

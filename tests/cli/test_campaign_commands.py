@@ -79,8 +79,9 @@ def test_montecarlo_writes_rows_summary_and_figures(command, tmp_path, monkeypat
     least = found["lower_bound"]
     assert 0.0 < least < told["rms"]
     for place in (said, read.text):
-        assert f"RMS error {told['rms']:.3g} x1: every requirement is met" in place
-        assert f"{formats.format_ratio(told['rms'] / least)} times the lower bound of {least:.3g} x1" in place
+        rms, bound = (formats.format_error(value, plant) for value in (told["rms"], least))
+        assert f"RMS {formats.error_name(plant)} {rms}: every requirement is met" in place
+        assert f"{formats.format_ratio(told['rms'] / least)} times the lower bound of {bound}" in place
     np.testing.assert_allclose([told["mean"], told["rms"], told["max"]],
                                [errors.mean(), np.sqrt(np.mean(errors**2)), errors.max()], rtol=1e-12)  # fmt: skip
     assert told["0.9"]["value"] == np.sort(errors)[224]
