@@ -69,7 +69,9 @@ def test_the_published_law_as_a_custom_law_gives_the_same_run(plant):
         tables |= {"disturbance": {"kind": "sinusoid"}, "observer": {"kind": "nonlinear", "gain": [10.0]}}
     error, rate = ({"error": "additive"}, 1.5) if plant == "spacecraft" else ({}, 0.75)  # k1 of (29) is half of (60)'s
     both = []
-    for law in (MINE | error | {"k1": 1.5}, {"kind": "prescribed_time", "t_f": 5.0, "k1": rate}):
+    constants = {"surface_rate": 1.0, "sign_width": 1e-3, "layer_time": 1.0}  # of the custom law
+    published = {"kind": "prescribed_time", "t_f": 5.0, "k1": rate, **constants}
+    for law in (MINE | error | {"k1": 1.5}, published):
         both.append(simulated({**tables, "controller": {**law, "eta": 2.7, "delta": 0.5}}))
     # equal to the last bit with the settings of `ptsmc`; here two programs may fuse differently, and gains amplify it
     for mine, builtin in zip(*map(jax.tree.leaves, both), strict=True):
