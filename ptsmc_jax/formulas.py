@@ -170,7 +170,7 @@ def pointing_angle(error: ArrayLike) -> np.ndarray:
 
 
 def angle_unit(largest: float) -> tuple[str, float]:
-    """Return the unit in which angles up to a largest angle [rad] are shown, and how many of it a radian has.
+    """Return the unit that shows angles of at most `largest` [rad], and the number of these units in a radian.
 
     >>> angle_unit(0.01)[0], angle_unit(0.02)[0]
     ('arcsec', 'deg')

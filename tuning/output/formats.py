@@ -65,8 +65,9 @@ def format_error(value: float | None, plant: str) -> str:
         return "-"
     if plant != "spacecraft":
         return format_metric(value, "window_error", plant)
-    # as `pointing_angle`, which would import NumPy for `ptsmc --help`
-    return format_angle(2.0 * math.asin(min(value, 1.0)))
+    from ptsmc_jax.formulas import pointing_angle  # here, so that `ptsmc --help` does not import NumPy
+
+    return format_angle(float(pointing_angle(value)))
 
 
 def error_name(plant: str) -> str:

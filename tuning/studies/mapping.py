@@ -128,15 +128,10 @@ def default_gain_axis(scenario: Scenario) -> str:
 
     The range is extended to include the scenario's delta, and up to twice this delta. For a law without delta, the axis
     is the law's first gain over its default bounds.
-
-    Raises:
-        UsageError: the law has no gain with bounds.
     """
     if not hasattr(scenario.controller, "delta"):
         bounds = replace_keys(scenario, tune={}).search.bounds
-        gain = next((name for name in scenario.controller.gains if name in bounds), None)
-        if gain is None:
-            raise UsageError(f"--y is required: controller.kind = {scenario.controller.kind} has no gain to vary")
+        gain = next(name for name in scenario.controller.gains if name in bounds)
         low, high = bounds[gain]
         return f"controller.{gain}={low:.4g}:{high:.4g}:9"
     delta, shortest = scenario.hand_over, scenario.loop.period
