@@ -173,7 +173,8 @@ def _simulated(parts, run, index, gain, late):
     def step(state, _):
         carry, sent = state
         decision, computer, model = linear._run_computer(parts, k2, period, carry, carry.x)
-        sent = jnp.concatenate([(gain * decision.u)[None], sent[:-1]])
+        u = parts.actuators.send(carry.actuators, decision.u, decision.w)[0] if delay else decision.u
+        sent = jnp.concatenate([(gain * u)[None], sent[:-1]])
         whole = jnp.floor(late).astype(int)
         part = jnp.max(late - whole)  # only one axis is delayed
         new = sent[whole + delay, axes]
