@@ -57,15 +57,18 @@ LARGER_IS_BETTER = tuple(f"{WITHIN}{name}" for name in TIME_FRACTION_METRICS)  #
 UNITS: dict[str, dict[str, float]] = {
     "rad": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": math.pi / 180, "arcmin": math.pi / 10_800,
             "arcsec": math.pi / 648_000},
-    "rad/s": {"rad/s": 1.0, "deg/s": math.pi / 180, "deg/h": math.pi / 648_000, "arcsec/s": math.pi / 648_000},
+    "rad/s": {"rad/s": 1.0, "deg/s": math.pi / 180, "deg/h": math.pi / 648_000, "arcsec/s": math.pi / 648_000,
+              "rpm": math.pi / 30, "Hz": 2.0 * math.pi},
     "rad/s/sqrt(Hz)": {"rad/s/sqrt(Hz)": 1.0, "deg/s/sqrt(Hz)": math.pi / 180, "deg/sqrt(h)": math.pi / 10_800},
     "rad/s/sqrt(s)": {"rad/s/sqrt(s)": 1.0, "deg/s/sqrt(s)": math.pi / 180, "deg/h/sqrt(h)": math.pi / 38_880_000},
-    "N m": {"N m": 1.0, "mN m": 1e-3, "uN m": 1e-6},
-    "N m s": {"N m s": 1.0, "mN m s": 1e-3, "uN m s": 1e-6},
-    "N m/s": {"N m/s": 1.0, "mN m/s": 1e-3, "uN m/s": 1e-6},
-    "s": {"s": 1.0, "ms": 1e-3, "min": 60.0},
+    "N m": {"N m": 1.0, "mN m": 1e-3, "uN m": 1e-6, "Nm": 1.0, "mNm": 1e-3, "uNm": 1e-6},
+    "N m s": {"N m s": 1.0, "mN m s": 1e-3, "uN m s": 1e-6, "Nms": 1.0, "mNms": 1e-3, "uNms": 1e-6},
+    "N m/s": {"N m/s": 1.0, "mN m/s": 1e-3, "uN m/s": 1e-6, "Nm/s": 1.0, "mNm/s": 1e-3, "uNm/s": 1e-6},
+    "s": {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0},
     "m": {"m": 1.0, "km": 1e3},
     "sqrt(kg) m": {"sqrt(kg) m": 1.0},
+    "deg": {"deg": 1.0, "rad": 180 / math.pi},
+    "dB": {"dB": 1.0},
 }  # fmt: skip
 CATALOGUES = {"spacecraft": CATALOGUE, "chain": STATE_CATALOGUE, "system": STATE_CATALOGUE}  # by the kind of the plant
 ANGLE_UNITS = {"spacecraft": "rad", "chain": "x1", "system": "x1"}  # unit of the column `initial_angle`

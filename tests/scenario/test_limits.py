@@ -26,6 +26,7 @@ SAMPLED = {"mode": "sampled"}
         ("window_angle", "5 arcsec", 5 / 3600 * math.pi / 180),
         ("terminal_angle", " 2  arcmin ", 2 / 60 * math.pi / 180),
         ("peak_torque", "5 mN m", 5e-3),
+        ("peak_torque", "5 mNm", 5e-3),
         ("peak_rate", "1e0 deg/s", math.pi / 180),
         ("settling_time", "0.5 min", 30.0),
         ("effort", 2, 2.0),
@@ -54,7 +55,8 @@ def test_every_metric_unit_of_a_spacecraft_accepts_text():
         ("controller", "t_f", "1 min", 60.0),
         ("loop", "period", "50 ms", 0.05),
         ("disturbance", "amplitude", ["1 mN m", 0.0, "20 uN m"], (1e-3, 0.0, 2e-5)),
-        ("disturbance", "amplitude", ("1 mN m", 0.0, "20 uN m"), (1e-3, 0.0, 2e-5)),
+        ("disturbance", "amplitude", ("1 mN m", 0.0, "20 uNm"), (1e-3, 0.0, 2e-5)),
+        ("disturbance", "frequency", ["0.5 Hz", "3 rpm", 1.0], (np.pi, np.pi / 10.0, 1.0)),
     ],
 )
 def test_a_number_can_be_text_with_a_unit(table, key, said, value):
@@ -66,6 +68,15 @@ def test_a_number_can_be_text_with_a_unit(table, key, said, value):
     assert scenario.from_tables(parsing.dump(read)) == read
     other = scenario.replace(scenario.from_tables({"loop": SAMPLED}), **{f"{table}__{key}": said})
     assert getattr(getattr(other, table), key) == getattr(getattr(read, table), key)
+
+
+@pytest.mark.parametrize(
+    ("metric", "said", "value"),
+    [("gain_margin", "6 dB", 6.0), ("phase_margin", "30 deg", 30.0), ("phase_margin", "0.5 rad", 28.6478897565)],
+)
+def test_a_required_margin_can_be_text_with_a_unit(metric, said, value):
+    read = scenario.from_tables({"loop": SAMPLED, "requirements": {metric: said}})
+    assert read.requirements == {metric: pytest.approx(value, rel=1e-11)}
 
 
 @pytest.mark.parametrize(("kind", "key"), [("normal", "std"), ("uniform", "half_width")])
