@@ -28,9 +28,10 @@ designed for the sampled loop. `orbit`, `flexible`, `hardware`, `sensors`, `whee
 `dispersion`, `requirements` and `tune` are off if they are absent. A key that is unknown, has the wrong type, is out of
 range or is not finite is refused with its name. `ptsmc new` writes a file with all of this.
 
-Numbers are in the unit of their key. Numbers in rad, rad/s, N m, N m s, s, m or the unit of a noise may have another
-unit: `"10 arcsec"`, `"2 deg/h"`, `"0.02 deg/sqrt(h)"`, `"5 mN m"`, `"50 ms"`, `"6878 km"`. In a list
-each number may have its own.
+Numbers are in the unit of their key. A text such as `"10 arcsec"` has a unit of its own. In a list each number may have
+its own. Allowed units are:
+
+UNITS
 
 A table with a `kind` has the keys of that kind. Commands that simulate write the complete scenario as `scenario.toml`
 beside their results. Conditions on several keys, such as `delta` of at least one control period, are reported if a
@@ -86,7 +87,9 @@ which are the short form for one star tracker and one gyro."""
 
 def scenarios() -> str:
     """Return the reference of scenario files. A kind of plant lists only the tables that earlier kinds do not have."""
-    parts = ["# Scenario files", MADE, SCENARIOS]
+    rows = [f"| {unit} | {', '.join(others)} |" for unit, (_, *others) in catalogues.UNITS.items() if others]
+    units = "\n".join(["| unit of the key | other units |", "| --- | --- |", *rows])
+    parts = ["# Scenario files", MADE, SCENARIOS.replace("UNITS", units)]
     seen: dict[type[Table], str] = {}
     whole: dict[tuple, str] = {}  # a table with all its kinds, the default first
     for plant, title in PLANTS.items():
