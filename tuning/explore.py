@@ -19,7 +19,7 @@ from ptsmc_jax.onboard.folder import on_flight_clock
 from ptsmc_jax.scenario import Study, reading
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.theory.run_margins import Course
-from tuning.output import campaign_report, front_report, margins_report, paper_report, summaries, tune_report
+from tuning.output import campaign_report, front_report, margins_report, reports, summaries, tune_report
 from tuning.output.report import Report, Table
 from tuning.studies import (
     campaign_figures,
@@ -298,7 +298,7 @@ class Reproduced(Outcome):
     @property
     def report(self) -> Report:
         """The report of `ptsmc reproduce`."""
-        return paper_report.build(summaries.read(summaries.Paper, reproduction.summary(self.reproduction)))
+        return reports.paper_report(reproduction.summary(self.reproduction))
 
     def _figures(self) -> dict[str, Any]:
         return reproduction.figures_of(self.reproduction)

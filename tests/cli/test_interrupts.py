@@ -15,6 +15,7 @@ from ptsmc_jax.campaigns import store
 from ptsmc_jax.scenario import parsing
 from tests.helpers import ROOT, SHORT_CHAIN, tree
 from tuning.cli import searches
+from tuning.output import reports
 from tuning.output.report import Report
 from tuning.studies import compare, pareto, tuner
 
@@ -66,10 +67,18 @@ def test_first_ctrl_c_ends_the_command_and_a_second_kills_it(twice, status, out,
 LOADED = scenario.from_tables(tomllib.loads(SHORT_CHAIN))
 
 
-def search_of(status, write, report=lambda _: EMPTY, command="tune"):
+@pytest.fixture(autouse=True)
+def shown(monkeypatch):
+    """The summaries whose reports are printed."""
+    summaries = []
+    monkeypatch.setattr(reports, "build", lambda command, summary, plant: summaries.append(summary) or EMPTY)
+    return summaries
+
+
+def search_of(status, write, command="tune"):
     """Return a search that ends with this status; `write` fills its folder."""
     made_by = {"command": command, "seed": 0}
-    return searches.LongSearch(made_by, "window error", lambda *_: SimpleNamespace(status=status), write, report)
+    return searches.LongSearch(made_by, "window error", lambda *_: SimpleNamespace(status=status), write)
 
 
 def recorded(summary, command="tune"):
@@ -79,37 +88,31 @@ def recorded(summary, command="tune"):
 
 
 @pytest.mark.parametrize(("force", "same"), [(False, "the same command"), (True, "the same command without --force")])
-def test_search_interrupted_during_writing_resumes(tmp_path, force, same):
+def test_search_interrupted_during_writing_resumes(tmp_path, shown, force, same):
     def stopped(making, outcome):
         (making / "summary.json").write_text(outcome.status)
         raise KeyboardInterrupt
 
-    search = search_of("met", stopped, lambda _: pytest.fail("there is nothing to show"))
     with pytest.raises(KeyboardInterrupt, match=f"^{same} resumes it$"):
-        searches.run(search, LOADED, tmp_path / "out", force=force, quiet=True)
+        searches.run(search_of("met", stopped), LOADED, tmp_path / "out", force=force, quiet=False)
+    assert shown == []
     assert set(tree(tmp_path / "out")) == {"journal.bin", "scenario.toml", "versions.json"}
 
 
 @pytest.mark.parametrize(("force", "same"), [(False, "the same command"), (True, "the same command without --force")])
-def test_interrupted_search_that_wrote_its_best_gains_resumes_without_force(tmp_path, capsys, force, same):
+def test_interrupted_search_that_wrote_its_best_gains_resumes_without_force(tmp_path, capsys, shown, force, same):
     """With --force, the same command would start again."""
-    shown = []
-    search = search_of(
-        "interrupted", recorded({"status": "interrupted"}), lambda summary: shown.append(summary["status"]) or EMPTY
-    )
+    search = search_of("interrupted", recorded({"status": "interrupted"}))
     assert searches.run(search, LOADED, tmp_path / "out", force=force, quiet=False) == 130
-    assert shown == ["interrupted"]
+    assert [summary["status"] for summary in shown] == ["interrupted"]
     assert capsys.readouterr().err == f"ptsmc: interrupted; {same} resumes it\n"
     assert {"journal.bin", "summary.json"} <= set(tree(tmp_path / "out"))
 
 
-def test_new_and_stored_results_of_a_search_have_the_same_report(tmp_path):
+def test_new_and_stored_results_of_a_search_have_the_same_report(tmp_path, shown):
     """Earlier, the report of a new front without gains printed "|S| at most inf dB", but the stored one did not."""
-    shown = []
     said = {"status": "not met", "without": [math.inf, 6.0], "slews": ({"rms": np.float64(math.nan)},)}
-    search = search_of(
-        "not met", recorded(said, "pareto"), lambda summary: shown.append(summary) or EMPTY, command="pareto"
-    )
+    search = search_of("not met", recorded(said, "pareto"), command="pareto")
     for _ in range(2):
         assert searches.run(search, LOADED, tmp_path / "out", force=False, quiet=False) == 1
     assert shown == 2 * [{"status": "not met", "without": [None, 6.0], "slews": [{"rms": None}]}]

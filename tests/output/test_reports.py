@@ -22,11 +22,10 @@ from tuning.output import (
     campaign_report,
     compare_report,
     front_report,
-    map_report,
     margins_report,
     page_charts,
     pointing_report,
-    run_report,
+    reports,
     summaries,
     trials_report,
     tune_report,
@@ -313,7 +312,7 @@ def pairs(count: int) -> Iterable[str]:
         {**pair, "x": 2.0, "y": 1.0, "not_converged": 2.0, "window_error": 1e-6},
         {**pair, "x": 2.0, "y": 2.0, "status": "not allowed", "window_error": math.nan},
     ]
-    return map_report.summary_lines(every[:count], ("loop.period", "controller.delta"), "spacecraft")
+    return reports.map_lines(every[:count], ("loop.period", "controller.delta"), "spacecraft")
 
 
 def compared() -> Table:
@@ -341,7 +340,7 @@ def winner(least: float) -> str:
 
 def run(lower_bound: float | None) -> Report:
     told = {"status": "ok", "reason": "", "bad_time": None, "window_error": 1e-5, "verdicts": {}, "warnings": []}
-    return run_report.build(summaries.run({**told, "lower_bound": lower_bound}, "spacecraft"), "spacecraft")
+    return reports.build("simulate", {**told, "lower_bound": lower_bound}, "spacecraft")
 
 
 def approach(judged: bool) -> Report:

@@ -328,11 +328,10 @@ def replay(
         origin = {"campaign": str(folder.absolute()), "metrics": campaign.custom_metrics} if needs_campaign else {}
         store.write_folder(replay_folder, lambda staging: single.write(staging, *run_details, origin))
     if not common.quiet:
-        from tuning.output import run_report, summaries
+        from tuning.output import reports
 
-        plant = campaign.scenario.plant.kind
-        summary = summaries.run(single.summary(repeated.run, campaign.scenario, campaign.computer), plant)
-        terminal.print_report(run_report.build(summary, plant), replay_folder)
+        summary = single.summary(repeated.run, campaign.scenario, campaign.computer)
+        terminal.print_report(reports.build("simulate", summary, campaign.scenario.plant.kind), replay_folder)
         terminal.print_lines(
             *trials_report.replay_lines(repeated.difference, repeated.rounding, campaign_summary.TOLERANCE)
         )
@@ -356,9 +355,9 @@ def _summarise(folder: "Folder", quiet: bool, figures: bool, *, write: bool = Tr
         if write:
             campaign_summary.write_summary(folder, summary, figures)
     if not quiet:
-        from tuning.output import campaign_report, summaries
+        from tuning.output import reports
 
-        terminal.print_report(campaign_report.build(summaries.read(summaries.Campaign, summary)), folder.path)
+        terminal.print_report(reports.build("montecarlo", summary, folder.scenario.plant.kind), folder.path)
     return 0 if summary["status"] == "met" else 1
 
 

@@ -90,10 +90,10 @@ def simulate(
 
         store.write_folder(folder, write)
     if not common.quiet:
-        from tuning.output import run_report, summaries
+        from tuning.output import reports
 
-        summary = summaries.run(single.summary(run, loaded, computer), loaded.plant.kind)
-        terminal.print_report(run_report.build(summary, loaded.plant.kind), folder)
+        summary = single.summary(run, loaded, computer)
+        terminal.print_report(reports.build("simulate", summary, loaded.plant.kind), folder)
     return 0 if run.met else 1
 
 
@@ -118,10 +118,9 @@ def reproduce(*, out: Out = None, force: Force = False, quiet: Quiet = False, fi
             reproduced = reproduction.reproduce()
         store.write_folder(folder, lambda staging: reproduction.write(staging, reproduced, figures))
     if not quiet:
-        from tuning.output import paper_report, summaries
+        from tuning.output import reports
 
-        summary = summaries.read(summaries.Paper, reproduction.summary(reproduced))
-        terminal.print_report(paper_report.build(summary), folder)
+        terminal.print_report(reports.paper_report(reproduction.summary(reproduced)), folder)
     return 0 if reproduced.ok else 1
 
 
@@ -163,11 +162,11 @@ def map_(
             )
         store.write_folder(folder, lambda staging: mapping.write(staging, results, seed, common.figures))
     if not common.quiet:
-        from tuning.output import map_report
+        from tuning.output import reports
 
         pairs = [dataclasses.asdict(cell) for cell in results.cells]
         terminal.print_lines(
-            *map_report.summary_lines(pairs, (x_axis.key, y_axis.key), loaded.plant.kind), f"results in {folder}"
+            *reports.map_lines(pairs, (x_axis.key, y_axis.key), loaded.plant.kind), f"results in {folder}"
         )
     return 0
 
@@ -198,9 +197,9 @@ def margins(
         store.write_folder(folder, lambda staging: stability.write(staging, ready, course, common.figures))
     summary = stability.summary(ready, course)
     if not common.quiet:
-        from tuning.output import margins_report, summaries
+        from tuning.output import reports
 
-        terminal.print_report(margins_report.build(summaries.read(summaries.Margins, summary)), folder)
+        terminal.print_report(reports.build("margins", summary, loaded.plant.kind), folder)
     return 0 if summary["stable"] else 1
 
 
@@ -226,7 +225,6 @@ def tune(
     """
     loaded, folder = prepare(scenario, "tune", out, device, trust=common.trust)
     from ptsmc_jax.scenario.tables import objective_name
-    from tuning.output import summaries, tune_report
     from tuning.studies import posing, tune_files, tuner
 
     loaded = posing.with_tune(loaded)
@@ -236,7 +234,6 @@ def tune(
         objective_name(loaded.search),
         work=lambda report, journal: tuner.tune(loaded, seed, report, journal, with_global_check=global_check),
         write=lambda staging, tuning: tune_files.write(staging, loaded, tuning, common.figures, identity),
-        report=lambda summary: tune_report.build(summaries.tune(summary)),
     )
     return searches.run(search, loaded, folder, force=common.force, quiet=common.quiet)
 
@@ -263,9 +260,8 @@ def pareto(
     """
     values = parse_traded_values(against, points, times, limits)
     loaded, folder = prepare(scenario, "pareto", out, device, trust=common.trust)
-    from tuning.output import front_report
-    from tuning.studies import front, posing, trades
     from tuning.studies import pareto as fronts
+    from tuning.studies import posing, trades
 
     trade = trades.build(against, posing.with_tune(loaded), points, values)
     loaded, identity = trade.scenario, trade.identity(seed) | {"device": device}
@@ -274,7 +270,6 @@ def pareto(
         "window error",
         work=lambda report, journal: fronts.trace(trade, seed, report, journal),
         write=lambda staging, traced_front: fronts.write(staging, trade, traced_front, common.figures, identity),
-        report=lambda summary: front_report.build(front.read(summary)),
     )
     return searches.run(search, loaded, folder, force=common.force, quiet=common.quiet)
 
@@ -300,7 +295,6 @@ def compare(
     """
     loaded, folder = prepare(scenario, "compare", out, device, trust=common.trust)
     from ptsmc_jax.scenario.tables import objective_name
-    from tuning.output import compare_report, summaries
     from tuning.studies import compare as comparing
     from tuning.studies import posing
 
@@ -315,7 +309,6 @@ def compare(
         objective_name(loaded.search),
         work=lambda report, journal: comparing.compare(loaded, seed, report, journal, validated()),
         write=lambda staging, comparison: comparing.write(staging, loaded, comparison, common.figures, identity),
-        report=lambda summary: compare_report.build(summaries.read(summaries.Compare, summary)),
         check=validated,
     )
     return searches.run(search, loaded, folder, force=common.force, quiet=common.quiet)

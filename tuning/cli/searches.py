@@ -13,7 +13,6 @@ from tuning.output.progress import Progress
 
 if TYPE_CHECKING:
     from ptsmc_jax.scenario.tables import Scenario
-    from tuning.output.report import Report
     from tuning.search.journal import Journal
 
 COMMANDS = ("tune", "pareto", "compare")
@@ -28,7 +27,6 @@ class LongSearch:
     objective: str  # name of the objective in the progress
     work: Callable[[Progress, "Journal"], Any]  # runs the search; its result has a `status`
     write: Callable[[Path, Any], None]  # writes the result into a result folder
-    report: Callable[[dict[str, Any]], "Report"]  # makes the report from the content of summary.json
     check: Callable[[], Any] = lambda: None  # raises configuration errors that the scenario does not have
 
 
@@ -65,7 +63,10 @@ def run(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, qu
             summary = store.read_previous_summary(folder, tables, search.identity)
     assert summary is not None
     if not quiet:
-        terminal.print_report(search.report(summary), folder, earlier=was_finished)
+        from tuning.output import reports
+
+        report = reports.build(search.identity["command"], summary, loaded.plant.kind)
+        terminal.print_report(report, folder, earlier=was_finished)
     return STATUS[summary["status"]]
 
 

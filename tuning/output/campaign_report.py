@@ -11,7 +11,6 @@ from ptsmc_jax.simulation.catalogues import percent
 from tuning.output import pointing_report, report
 from tuning.output.formats import format_count, format_named_error, format_number, list_counts
 from tuning.output.report import Block, Report, Section, Table, Text
-from tuning.output.run_report import bound_lines, warning_lines
 from tuning.output.summaries import Campaign, Entry, Quantile
 
 NOTES = {
@@ -35,9 +34,9 @@ def build(summary: Campaign) -> Report:
         *pointing_report.pointing_sections(summary),
     ]
     lines = [
-        *bound_lines(error, summary.lower_bound, summary.plant),
+        *report.bound_lines(error, summary.lower_bound, summary.plant),
         *count_lines(summary),
-        *warning_lines(summary.warnings),
+        *report.warning_lines(summary.warnings),
     ]
     return Report(headline, mood, lines, sections)
 

@@ -9,8 +9,7 @@ from ptsmc_jax.formulas import ARCSEC, pointing_angle
 from ptsmc_jax.simulation.catalogues import MARGINS
 from tuning.output import page_charts
 from tuning.output.formats import failed_counts, format_count, format_number, format_ratio, list_counts, ratio_to_bound
-from tuning.output.report import Chart, Report, Section, Table, Text
-from tuning.output.run_report import warning_lines
+from tuning.output.report import Chart, Report, Section, Table, Text, warning_lines
 from tuning.output.summaries import Compare, Entry, Interval, Law, Number
 
 

@@ -5,8 +5,7 @@ from collections.abc import Iterator, Sequence
 
 from tuning.output import margins_report
 from tuning.output.formats import format_count, format_error, format_metric, format_number, format_ratio, ratio_to_bound
-from tuning.output.report import Report, Section, Table, Text
-from tuning.output.run_report import warning_lines
+from tuning.output.report import Report, Section, Table, Text, warning_lines
 from tuning.studies.front import KINDS, Front, Point, metric_heading, unit_of
 
 USUAL_LIMIT = margins_report.USUAL_MARGINS["gain_margin"]  # limit on |S| that the summary states first [dB]

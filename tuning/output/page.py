@@ -10,7 +10,7 @@ import hashlib
 import json
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,21 +22,8 @@ from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.scenario import parsing
 from tuning.errors import UsageError
-from tuning.output import (
-    campaign_report,
-    compare_report,
-    front_report,
-    identify_report,
-    map_report,
-    margins_report,
-    page_captions,
-    page_charts,
-    paper_report,
-    run_report,
-    summaries,
-    tune_report,
-)
-from tuning.output.report import Chart, Code, Picture, Report, Section, Table
+from tuning.output import campaign_report, page_captions, page_charts, reports
+from tuning.output.report import Block, Chart, Code, Picture, Report, Section, Table
 from tuning.studies import front
 
 HERE = Path(__file__).parent
@@ -58,11 +45,6 @@ class Result:
         """Return the kind of the plant."""
         return self.scenario.get("plant", {}).get("kind", "spacecraft")
 
-    def rows(self, name: str) -> list[list[str]]:
-        """Return the rows of a CSV file with its head."""
-        with (self.folder / name).open(newline="", encoding="utf-8") as file:
-            return list(csv.reader(file))
-
 
 def read(folder: Path) -> Result:
     """Read a result folder. Raises RefusedError if it holds no finished result."""
@@ -73,10 +55,13 @@ def read(folder: Path) -> Result:
             raise RefusedError(f"{folder / name} is a link out of the folder; allowed is a file in it")
     versions = store.read_versions(folder)
     command = versions.get("command")
-    if str(command) not in REPORTS:
+    if str(command) not in reports.REPORTS:
         raise RefusedError(f"{folder} holds no result; allowed is a folder that a ptsmc command wrote")
     try:
-        summary = json.loads((folder / store.SUMMARY).read_text(encoding="utf-8")) if command != "map" else {}
+        if command == "map":
+            summary = {"rows": _read_rows(folder / "map.csv")}
+        else:
+            summary = json.loads((folder / store.SUMMARY).read_text(encoding="utf-8"))
         path = folder / "scenario.toml"
         scenario = parsing.parse_toml(path.read_text(encoding="utf-8"), str(path)) if path.exists() else {}
     except FileNotFoundError:
@@ -84,6 +69,12 @@ def read(folder: Path) -> Result:
     except (ValueError, RecursionError) as error:
         raise RefusedError(f"{folder} holds a file that cannot be read: {error}") from None
     return Result(folder, versions, summary, scenario)
+
+
+def _read_rows(path: Path) -> list[list[str]]:
+    """Return the rows of a CSV file with its head."""
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.reader(file))
 
 
 def _is_outside(folder: Path, path: Path) -> bool:
@@ -112,7 +103,8 @@ def build(folder: Path) -> str:
     except ImportError as error:
         raise UsageError(f"the page needs {error.name}: pip install 'ptsmc-jax[report]'") from None
     try:
-        report = REPORTS[result.versions["command"]](result)
+        command = result.versions["command"]
+        report = _add_charts(reports.build(command, result.summary, result.plant), result)
     except FileNotFoundError:
         raise _unfinished_error(folder, result.versions) from None
     except (msgspec.ValidationError, KeyError, AttributeError, TypeError) as error:
@@ -152,12 +144,8 @@ def _policy_checksum(script: str) -> str:
     return base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii")
 
 
-def _add_sections(report: Report, *sections: Section) -> Report:
-    """Return a report with further sections."""
-    return replace(report, sections=[*report.sections, *sections])
-
-
-def _simulate_report(result: Result) -> Report:
+def _history_charts(result: Result) -> list[Block]:
+    """Return the charts of a run."""
     columns = page_charts.read_trajectory(result.folder / "trajectory.csv")
     law = result.scenario["controller"]
     marks = {"t_f": law["t_f"], **({"t_f - delta": law["t_f"] - law["delta"]} if "delta" in law else {})}
@@ -165,63 +153,43 @@ def _simulate_report(result: Result) -> Report:
         del marks["t_f - delta"]
     spacecraft = result.plant == "spacecraft"
     caption = "Drag to zoom, double-click to see all; the dotted lines are the hand-over and t_f."
-    charts = [Chart("history", page_charts.history(columns, spacecraft, marks), caption, "tall")]
+    charts: list[Block] = [Chart("history", page_charts.history(columns, spacecraft, marks), caption, "tall")]
     if spacecraft:
         q = np.stack([columns[f"q{k + 1}"] for k in range(4)], axis=1)
         caption = "The body and its axes over time; dashed: the inertial axes. Drag to turn the view."
         charts.append(Chart("attitude", page_charts.attitude(columns["t"], q), caption, "square"))
-    report = run_report.build(summaries.run(result.summary, result.plant), result.plant)
-    return _add_sections(report, Section("History", [*charts]))
+    return charts
 
 
-def _tune_report(result: Result) -> Report:
-    head, *rows = result.rows("history.csv")
+def _search_chart(result: Result) -> Chart:
+    """Return the chart of a search."""
+    head, *rows = _read_rows(result.folder / "history.csv")
     points = [dict(zip(head, row, strict=True)) for row in rows]
     caption = "The objective along the local search from each starting point; a hollow point breaks a limit."
-    chart = Chart("search", page_charts.search(points, head[2]), caption)
-    return _add_sections(tune_report.build(summaries.tune(result.summary)), Section("Search", [chart]))
+    return Chart("search", page_charts.search(points, head[2]), caption)
 
 
-def _pareto_report(result: Result) -> Report:
-    pareto = front.read(result.summary)
-    report = front_report.build(pareto)
-    if pareto.against != "torque":
-        return report
+def _front_chart(result: Result) -> Chart:
+    """Return the chart of a front of error against torque."""
     caption = "Hover over a point for its gains. Bars are 95 % intervals; the dashed line is the required limit."
     requirement = result.scenario.get("requirements", {}).get("peak_torque")
     limit = requirement.get("limit") if isinstance(requirement, dict) else requirement
-    (section,) = report.sections
-    chart = Chart("front", page_charts.front(pareto, limit), caption)
-    return replace(report, sections=[replace(section, blocks=[chart, *section.blocks])])
+    return Chart("front", page_charts.front(front.read(result.summary), limit), caption)
 
 
-def _montecarlo_report(result: Result) -> Report:
-    report = campaign_report.build(summaries.read(summaries.Campaign, result.summary))
-    return _add_sections(report, Section("Gains", [campaign_report.gain_table(result.scenario, result.plant)]))
-
-
-def _identify_report(result: Result) -> Report:
-    if result.summary.get("status") == "designed":
-        return identify_report.build_design(summaries.read(summaries.Designed, result.summary))
-    return identify_report.build(summaries.read(summaries.Identified, result.summary))
-
-
-def _map_report(result: Result) -> Report:
-    head, *rows = result.rows("map.csv")
-    return map_report.build(head, rows, result.plant)
-
-
-REPORTS: dict[str, Callable[[Result], Report]] = {
-    "simulate": _simulate_report,
-    "tune": _tune_report,
-    "pareto": _pareto_report,
-    "compare": lambda result: compare_report.build(summaries.read(summaries.Compare, result.summary)),
-    "montecarlo": _montecarlo_report,
-    "map": _map_report,
-    "identify": _identify_report,
-    "margins": lambda result: margins_report.build(summaries.read(summaries.Margins, result.summary)),
-    "reproduce": lambda result: paper_report.build(summaries.read(summaries.Paper, result.summary)),
-}
+def _add_charts(report: Report, result: Result) -> Report:
+    """Return a report with the charts and the table that only the page shows."""
+    command, sections = result.versions["command"], report.sections
+    if command == "simulate":
+        sections = [*sections, Section("History", _history_charts(result))]
+    elif command == "tune":
+        sections = [*sections, Section("Search", [_search_chart(result)])]
+    elif command == "montecarlo":
+        gains = campaign_report.gain_table(result.scenario, result.plant)
+        sections = [*sections, Section("Gains", [gains])]
+    elif command == "pareto" and result.summary["against"] == "torque":
+        sections = [replace(section, blocks=[_front_chart(result), *section.blocks]) for section in sections]
+    return replace(report, sections=sections)
 
 
 def _figure_sections(result: Result) -> Iterator[Section]:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from tuning.output.formats import format_ratio
+from tuning.output.formats import format_error, format_ratio, ratio_to_bound
 
 if TYPE_CHECKING:  # summaries imports NumPy, which a command that computes nothing need not wait for
     from tuning.output.summaries import Entry
@@ -157,3 +157,15 @@ def per_cent_of_limit(entry: "Entry") -> str:
     if entry.fraction_of_time is not None:
         return f"; {format_ratio(100 * entry.margin)} % of the time allowed beyond the limit"
     return f"; {format_ratio(100 * entry.margin)} % of the limit"
+
+
+def bound_lines(value: float | None, lower_bound: float | None, plant: str) -> Iterator[str]:
+    """Return the ratio of an error to its lower bound; nothing without a bound."""
+    ratio = ratio_to_bound(value, lower_bound)
+    if ratio is not None:
+        yield f"{format_ratio(ratio)} times the lower bound of {format_error(lower_bound, plant)} with these sensors"
+
+
+def warning_lines(texts: list[str]) -> list[str]:
+    """Return the warnings about a scenario as lines."""
+    return [f"WARNING: {text}" for text in texts]

@@ -17,7 +17,6 @@ from tuning.output.formats import (
     ratio_to_bound,
 )
 from tuning.output.report import Report, Section, Table, Text
-from tuning.output.run_report import warning_lines
 from tuning.output.summaries import Check, Entry, Group, Hardest, Search, Tune
 
 GRADIENT_TOLERANCE = 0.01  # largest relative difference of gradients from finite differences
@@ -44,7 +43,7 @@ def build(summary: Tune) -> Report:
         Section("Gains", [gain_table(summary)]),
         Section("Can the result be trusted?", [Text(trust_lines)]),
     ]
-    return Report(headline, mood, [*accuracy_lines(summary), *warning_lines(summary.warnings)], sections)
+    return Report(headline, mood, [*accuracy_lines(summary), *report.warning_lines(summary.warnings)], sections)
 
 
 def _gain_columns(summary: Tune) -> dict[str, Group]:

@@ -1,0 +1,187 @@
+"""The report of each command. Start with `build`. The longer reports have modules of their own."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+from ptsmc_jax.campaigns import store
+from ptsmc_jax.simulation.catalogues import CATALOGUES
+from tuning.output import campaign_report, compare_report, front_report, margins_report, report, summaries, tune_report
+from tuning.output.formats import (
+    add_unit,
+    format_error,
+    format_metric,
+    format_named_error,
+    format_number,
+    list_counts,
+    parse_cell,
+)
+from tuning.output.report import Report, Section, Table
+from tuning.studies import front
+
+LOG_NOTE = """mean square: of the innovations over their variance. White innovations have a mean square of 1 and no
+autocorrelation."""
+MAP_NOTE = (
+    "linear_window_error and linear_torque are predictions of linear theory for the noise alone, with explicit "
+    "sampling. radius, gain_margin and delay_margin belong to the loop at the hand-over with frozen gains, hold_radius "
+    "and the others with hold_ to the hold phase. The loop is stable up to a radius of 1. gain_margin is the largest "
+    "factor on the gain with a stable loop; below 1 the loop is unstable."
+)
+
+
+def build(command: str, summary: Mapping[str, Any], plant: str) -> Report:
+    """Return the report of a result.
+
+    Args:
+        command: name of the command, a key of `REPORTS`.
+        summary: the content of `summary.json`, stored or just computed; of a map the "rows" of `map.csv` with its head.
+        plant: kind of the plant.
+
+    Raises:
+        KeyError, AttributeError, TypeError, msgspec.ValidationError: `summary` is not from this version of the command.
+    """
+    return REPORTS[command](summary, plant)
+
+
+def run_report(summary: summaries.Run, plant: str) -> Report:
+    """Return the report of one run of this kind of plant."""
+    status, error = summary.status, summary.metrics.get("window_error")
+    if status == "ok" and summary.verdicts:
+        status = "met" if all(one.met for one in summary.verdicts) else "not met"
+    headline, mood = report.headline(status, summary.verdicts, format_named_error(error, plant))
+    lines = [*report.bound_lines(error, summary.lower_bound, plant)]
+    if summary.reason:
+        when = "" if summary.bad_time is None else f", at {summary.bad_time:.4g} s"
+        lines.append(f"status {summary.status}: {summary.reason}{when}")
+    if summary.controller_statuses:
+        lines.append(f"samples of the controller: {list_counts(summary.controller_statuses)}")
+    missing = "never" if summary.status in ("ok", "not_converged") else "-"
+    rows = [
+        (name, format_number(summary.metrics[name], ".5g", missing), entry.unit, entry.meaning)
+        for name, entry in CATALOGUES[plant].items()
+        if name in summary.metrics
+    ]
+    metrics = Section("Metrics", [Table(("metric", "value", "unit", "meaning"), rows)])
+    sections = [*report.requirement_sections(summary.verdicts), metrics]
+    return Report(headline, mood, [*lines, *report.warning_lines(summary.warnings)], sections)
+
+
+def paper_report(summary: Mapping[str, Any]) -> Report:
+    """Return the report of `ptsmc reproduce`."""
+    claims = [(one["verdict"], f"{one['where']}: {one['claim']}", one["measured"]) for one in summary["claims"]]
+    slips = [(one["where"], one["correct"], one["shown"]) for one in summary["slips"]]
+    counts = ", ".join(f"{count}: {word}" for word, count in summary["verdicts"].items())
+    return Report(
+        f"{summary['verdicts'].get('holds', 0)} of {len(claims)} claims of the paper hold literally",
+        "calm",
+        [counts, "claims.md states the reasons, and quotes the errors"],
+        [
+            Section("Claims of the paper", [Table(("verdict", "the paper", "measured"), claims)]),
+            Section("Errors of the paper", [Table(("where", "correct", "evidence"), slips)]),
+        ],
+    )
+
+
+def identify_report(summary: Mapping[str, Any]) -> Report:
+    """Return the report of `ptsmc identify`: tables of the estimated numbers and of the logs, or of a design."""
+    summary = store.to_json_value(summary)
+    if summary["status"] == "designed":
+        return _design_report(summary)
+    estimates = [
+        (one["parameter"], f"{one['estimate']:.6g}", f"{one['std']:.2g}", f"{one['lower']:.5g} to {one['upper']:.5g}",
+         f"{one['start']:.6g}", format_number(one["prior_std"], ".2g", "none"), one["unit"] or "-")
+        for one in summary["parameters"]
+    ]  # fmt: skip
+    for bias in summary["gyro_bias"]:
+        for axis, value, std in zip("xyz", bias["estimate"], bias["std"], strict=True):
+            name = f"gyro bias {axis} at the end of {bias['log']}"
+            interval = f"{value - 1.96 * std:.5g} to {value + 1.96 * std:.5g}"
+            estimates.append((name, f"{value:.6g}", f"{std:.2g}", interval, "-", "-", "rad/s"))
+    estimate_head = ("parameter", "estimate", "1 sigma", "95 % interval", "scenario", "prior 1 sigma", "unit")
+    logs = []
+    for use, fits in (("estimation", summary["logs"]), ("validation", summary["validation"])):
+        for fit in fits:
+            largest = max((abs(value or 0.0) for value in fit["largest_autocorrelation"].values()), default=0.0)
+            numbers = (str(fit["readings"]), str(fit["outliers"]), f"{fit['mean_square']:.4g}", f"{largest:.2g}")
+            logs.append((fit["log"], use, f"{fit['duration']:.4g}", *numbers, "yes" if fit["white"] else "NO"))
+    log_head = ("log", "use", "duration [s]", "readings", "outliers", "mean square", "autocorrelation", "white")
+    sections = [
+        Section("Estimates", [Table(estimate_head, estimates)]),
+        Section("Logs", [Table(log_head, logs, LOG_NOTE)]),
+    ]
+    is_identified = summary["status"] == "identified"
+    headline = "The model explains the telemetry" if is_identified else "The model is DOUBTFUL"
+    return Report(headline, "good" if is_identified else "bad", summary["verdict"], sections)
+
+
+def _design_report(summary: Mapping[str, Any]) -> Report:
+    """Return the report of `ptsmc identify --design`."""
+    rows = [
+        (one["parameter"], *(f"{one[key]:.3g}" for key in ("value", "expected_std", "plain_std")), one["unit"])
+        for one in summary["parameters"]
+    ]
+    table = Table(
+        ("parameter", "scenario", "expected 1 sigma", "after plain slews", "unit"), rows,
+        "Plain slews: one about each axis, one after another, within the same limits and time.",
+    )  # fmt: skip
+    lines = ["send the torque in profile.csv, and record attitude, rate and torque for ptsmc identify"]
+    headline = f"Proposed a manoeuvre of {summary['duration']:.4g} s"
+    return Report(headline, "calm", [*lines, *summary["undetermined"]], [Section("Expected accuracy", [table])])
+
+
+def map_report(rows: Sequence[Sequence[str]], plant: str) -> Report:
+    """Return the report of the rows of a map.csv for this kind of plant; the first two columns are the keys."""
+    head, *rows = rows
+    pairs = [dict(zip(("x", "y", *head[2:]), map(parse_cell, row), strict=True)) for row in rows]
+    headline, *lines = map_lines(pairs, (head[0], head[1]), plant)
+    cells = [tuple(_shorten_cell(cell) for cell in row) for row in rows]
+    table = Table(tuple(add_unit(name, plant) for name in head), cells, MAP_NOTE)
+    return Report(headline[0].upper() + headline[1:], "calm", lines, [Section("Pairs", [table])])
+
+
+def map_lines(pairs: Sequence[Mapping[str, Any]], keys: tuple[str, str], plant: str) -> Iterator[str]:
+    """Return the best pair and the number of pairs that were simulated.
+
+    Args:
+        pairs: the rows of a map by column; x and y are the values of the keys.
+        keys: keys of the horizontal and of the vertical axis.
+        plant: kind of the plant.
+    """
+    simulated = [pair for pair in pairs if pair["status"] == "simulated"]
+    with_error = [pair for pair in simulated if pair["window_error"] == pair["window_error"]]  # is not NaN
+    if with_error:
+        best = min(with_error, key=lambda pair: (_count_failures(pair), pair["window_error"]))
+        count = _count_failures(best)
+        failures = f"; {count:.0f} of its trials failed or did not converge at t_f" if count else ""
+        peak = format_metric(best["peak_torque"], "peak_torque", plant)
+        yield (
+            f"the smallest RMS error is {format_error(best['window_error'], plant)} at {keys[0]} = {best['x']:.4g} and "
+            f"{keys[1]} = {best['y']:.4g}, with a mean peak torque of {peak}{failures}"
+        )
+    failed = sum(_count_failures(pair) > 0 for pair in simulated)
+    yield (
+        f"{len(simulated)} of {len(pairs)} pairs simulated, {failed} of them with trials that failed or "
+        "did not converge at t_f"
+    )
+
+
+def _count_failures(pair: Mapping[str, Any]) -> float:
+    """Return how many trials of a pair failed or did not converge at t_f, as a float like all cells of map.csv."""
+    return pair["failures"] + pair["not_converged"]
+
+
+def _shorten_cell(cell: str) -> str:
+    value = parse_cell(cell)
+    return cell if isinstance(value, str) or not cell else format_number(value, ".4g", "")
+
+
+REPORTS: dict[str, Callable[[Mapping[str, Any], str], Report]] = {
+    "simulate": lambda summary, plant: run_report(summaries.run(summary, plant), plant),
+    "tune": lambda summary, _: tune_report.build(summaries.tune(summary)),
+    "pareto": lambda summary, _: front_report.build(front.read(summary)),
+    "compare": lambda summary, _: compare_report.build(summaries.read(summaries.Compare, summary)),
+    "montecarlo": lambda summary, _: campaign_report.build(summaries.read(summaries.Campaign, summary)),
+    "margins": lambda summary, _: margins_report.build(summaries.read(summaries.Margins, summary)),
+    "identify": lambda summary, _: identify_report(summary),
+    "map": lambda summary, plant: map_report(summary["rows"], plant),
+    "reproduce": lambda summary, _: paper_report(summary),
+}
