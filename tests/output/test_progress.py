@@ -10,7 +10,6 @@ import pytest
 from ptsmc_jax import programs
 from ptsmc_jax.campaigns import campaign
 from tuning.output import progress, terminal
-from tuning.output.progress import ProgressLines
 from tuning.output.report import Table
 
 
@@ -29,15 +28,23 @@ def test_a_line_comes_also_while_nothing_new_is_said(capsys, monkeypatch):
     assert not capsys.readouterr().err
 
 
+def test_a_line_has_the_number_of_steps(capsys, monkeypatch):
+    monkeypatch.setattr(progress, "INTERVAL", 0.02)
+    with progress.Progress(quiet=False) as tell:
+        tell("searching", 1, 7)
+        time.sleep(0.2)
+    assert set(capsys.readouterr().err.splitlines()) == {"ptsmc: searching, 1 of 7, 0 s"}
+
+
 def test_trials_a_second_are_those_flown_since_the_command_began(monkeypatch):
     """3 000 in four seconds, of a campaign that goes on from 1 000; at first nothing is known. A slow rate is not 0."""
     at, said = iter([10.0, 14.0, 14.0, 16010.0]), []
     monkeypatch.setattr(progress.time, "monotonic", lambda: 0.0)
     bar = progress.CampaignProgress(quiet=True)
     monkeypatch.setattr(progress.time, "monotonic", lambda: next(at))
-    monkeypatch.setattr(bar, "_lines", lambda text, done, total: said.append(text))
     for done, failed in ((1000, 0), (4000, 2), (9000, 2), (9000, 2)):
         bar(campaign.Tally(done, 9000, failed))
+        said.append(bar.__rich__())
     assert said == [
         "1000 of 9000 trials, compiling",
         "4000 of 9000 trials, 750 a second, 2 failed or not converged",
@@ -65,7 +72,7 @@ def test_a_reader_that_has_read_enough_changes_nothing(unread, monkeypatch):
 def test_progress_that_nobody_reads_stops_nothing(unread, monkeypatch):
     monkeypatch.setattr("sys.stderr", unread)
     monkeypatch.setattr(progress, "INTERVAL", 0.01)
-    with ProgressLines(silent=False) as tell:
+    with progress.Progress(quiet=False) as tell:
         tell("searching", 1, 7)
         time.sleep(0.1)  # an error of its thread would be a warning, which fails the test
 

@@ -14,59 +14,10 @@ if TYPE_CHECKING:
 INTERVAL = 10.0  # time between two printed lines [s]
 
 
-def format_progress(step: str, done: int, total: int, seconds: float) -> str:
-    """Return a line of progress. A total of 0 means that the number of steps is unknown.
-
-    >>> format_progress("searching", 1, 7, 10.4), format_progress("compiling", 0, 0, 10.2)
-    ('ptsmc: searching, 1 of 7, 10 s', 'ptsmc: compiling, 10 s')
-    """
-    fraction = "" if not total else f", {done} of {total}"
-    return f"ptsmc: {step}{fraction}, {seconds:.0f} s"
-
-
-class ProgressLines:
-    """Prints the latest progress every ten seconds within `with`, also during long compilations.
-
-    Args:
-        silent: print nothing.
-    """
-
-    def __init__(self, *, silent: bool):
-        self._silent, self._start_time = silent, time.monotonic()
-        self._step, self._ended = ("compiling", 0, 0), threading.Event()
-
-    def __enter__(self) -> Self:
-        if not self._silent:
-            threading.Thread(target=self._print_periodically, daemon=True).start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._ended.set()
-
-    def __call__(self, step: str, done: int, total: int) -> None:
-        """Report the current step, and the number of steps done and in all."""
-        self._step = (step, done, total)
-
-    def __rich__(self) -> str:
-        """Return the current step, or the program that it waits for, for a column of `rich`."""
-        return _compilation_progress() or self._step[0]
-
-    def _print_periodically(self) -> None:
-        while not self._ended.wait(INTERVAL):
-            compiling, seconds = _compilation_progress(), time.monotonic() - self._start_time
-            text = format_progress(compiling, 0, 0, seconds) if compiling else format_progress(*self._step, seconds)
-            with contextlib.suppress(OSError):  # a closed pipe or a full disk is no reason to stop
-                print(text, file=sys.stderr, flush=True)
-
-
-def _compilation_progress() -> str:
-    """Return which program is being compiled, see `programs.compiling`, without importing JAX."""
-    programs = sys.modules.get("ptsmc_jax.programs")
-    return "" if programs is None else programs.compiling()
-
-
 class Bar:
-    """A progress bar with the time left, within `with`; `ProgressLines` if the error stream is no terminal.
+    """A progress bar with the time left within `with`. If the error stream is no terminal, it prints lines instead.
+
+    A thread prints the latest step every ten seconds, also during long compilations.
 
     Args:
         quiet: print nothing.
@@ -78,9 +29,11 @@ class Bar:
         from rich.console import Console
 
         console = Console(stderr=True)
-        self._lines = ProgressLines(silent=quiet or console.is_terminal)
+        self._prints_lines = not quiet and not console.is_terminal
+        self._start_time, self._ended = time.monotonic(), threading.Event()
+        self._step, self._count = "compiling", ""  # the step in words; numbers of steps, only for lines
         self._bar = progress.Progress(
-            progress.RenderableColumn(self._lines),
+            progress.RenderableColumn(self),
             progress.BarColumn(20),
             *([progress.MofNCompleteColumn()] if counted else []),
             progress.TimeElapsedColumn(),
@@ -89,16 +42,33 @@ class Bar:
             console=console,
             disable=quiet or not console.is_terminal,
         )
-        self._task = self._bar.add_task("compiling", total=None)
+        self._task = self._bar.add_task("", total=None)
 
     def __enter__(self) -> Self:
-        self._lines.__enter__()
+        if self._prints_lines:
+            threading.Thread(target=self._print_periodically, daemon=True).start()
         self._bar.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
-        self._lines.__exit__()
+        self._ended.set()
+
+    def __rich__(self) -> str:
+        """Return the current step, or the program that it waits for, for a column of `rich`."""
+        return _compilation_progress() or self._step
+
+    def _print_periodically(self) -> None:
+        while not self._ended.wait(INTERVAL):
+            text = _compilation_progress() or f"{self._step}{self._count}"
+            with contextlib.suppress(OSError):  # a closed pipe or a full disk is no reason to stop
+                print(f"ptsmc: {text}, {time.monotonic() - self._start_time:.0f} s", file=sys.stderr, flush=True)
+
+
+def _compilation_progress() -> str:
+    """Return which program is being compiled, see `programs.compiling`, without importing JAX."""
+    programs = sys.modules.get("ptsmc_jax.programs")
+    return "" if programs is None else programs.compiling()
 
 
 class Progress(Bar):
@@ -113,17 +83,16 @@ class Progress(Bar):
             plant: kind of the plant, which decides the unit of a window error.
         """
         super().__init__(quiet, counted=True)
-        self._objective, self._plant, self._total = objective, plant, 0
+        self._objective, self._plant = objective, plant
 
     def __call__(self, step: str, done: int, total: int, value: float = float("nan"), violation: float = 0.0) -> None:
         """Report the current step, the number of steps done and in all, the best objective, and its violation."""
-        if total != self._total:
-            self._total = total
+        if (total or None) != self._bar.tasks[0].total:
             self._bar.reset(self._task, total=total or None)
         limits = "limits met" if violation == 0.0 else f"{format_ratio(100.0 * violation)} % beyond a limit"
         best = f": {format_objective(self._objective, value, self._plant)}, {limits}" if value == value else ""
-        self._bar.update(self._task, completed=done, total=total or None)
-        self._lines(step + best, done, total)
+        self._bar.update(self._task, completed=done)
+        self._step, self._count = step + best, f", {done} of {total}" if total else ""
 
 
 class CampaignProgress(Bar):
@@ -147,4 +116,4 @@ class CampaignProgress(Bar):
             text += ", compiling"
         text += f", {tally.failed} failed or not converged" if tally.failed else ""
         self._bar.update(self._task, completed=tally.done, total=tally.total)
-        self._lines(text, 0, 0)
+        self._step = text

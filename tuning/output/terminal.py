@@ -35,24 +35,22 @@ def print_lines(*lines: str) -> None:
         _print(line, soft_wrap=True, markup=False)
 
 
-def print_table(content: Table, **style: Any) -> None:
-    """Print a table; style: of rich's `Table`."""
+def print_table(content: Table) -> None:
+    """Print a table."""
     from rich.console import Console
     from rich.markup import escape
-    from rich.measure import Measurement
     from rich.table import Table as RichTable
     from rich.text import Text as RichText
 
-    rich_table = RichTable(pad_edge=False, **{"box": None, **style})
-    for k, name in enumerate(content.head):
-        rich_table.add_column(escape(name), min_width=max((_smallest_width(row[k]) for row in content.rows), default=1))
+    rich_table = RichTable(pad_edge=False, box=None)
+    widths = [max((_smallest_width(row[k]) for row in content.rows), default=1) for k in range(len(content.head))]
+    for name, width in zip(content.head, widths, strict=True):
+        rich_table.add_column(escape(name), min_width=width)
     for row in content.rows:
         rich_table.add_row(*map(RichText, row))
+    console = Console()
     # A file or a pipe has no width. A terminal that is too narrow for the numbers wraps the lines itself.
-    width, console = WIDE, Console()
-    if console.is_terminal:
-        wide_console = Console(width=WIDE)
-        width = max(console.width, Measurement.get(wide_console, wide_console.options, rich_table).minimum)
+    width = max(console.width, sum(widths) + 2 * len(widths)) if console.is_terminal else WIDE
     _print(rich_table, width, crop=False)
 
 
