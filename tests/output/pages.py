@@ -9,7 +9,7 @@ from html.parser import HTMLParser
 
 import matplotlib.image
 
-from tuning.output import page, page_captions
+from tuning.output import page
 
 ELEMENTS = {
     "html", "head", "meta", "title", "link", "style", "body", "header", "p", "h1", "h2", "main", "section", "div",
@@ -75,7 +75,7 @@ def checked(folder):
     pictures = sorted((folder / "figures").glob("*.png"))
     assert len(read.images) == len(pictures)
     if read_versions(folder)["command"] != "reproduce":
-        assert all(page_captions.CAPTIONS[path.stem] in read.text for path in pictures)
+        assert all(page.CAPTIONS[path.stem] in read.text for path in pictures)
     for source, path in zip(read.images, pictures, strict=True):
         content = base64.b64decode(source.removeprefix("data:image/png;base64,"))
         assert content == path.read_bytes()

@@ -4,13 +4,13 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 from ptsmc_jax.formulas import ARCSEC, pointing_angle
 from ptsmc_jax.simulation.catalogues import MARGINS
-from tuning.output import page_charts
 from tuning.output.formats import failed_counts, format_count, format_number, format_ratio, list_counts, ratio_to_bound
-from tuning.output.report import Chart, Report, Section, Table, Text, warning_lines
-from tuning.output.summaries import Compare, Entry, Interval, Law, Number
+from tuning.output.report import Block, Chart, Report, Section, Table, Text, warning_lines
+from tuning.output.summaries import Compare, Interval, Law, Number
 
 
 @dataclass(frozen=True)
@@ -38,17 +38,9 @@ class Question:
     limit: str = ""  # metric whose limit the chart shows
 
 
-def _error_angle(error: Number) -> Number:
-    """Return a window error |v| as an angle [arcsec]."""
-    return None if error is None else float(ARCSEC * pointing_angle(error))
-
-
-def _error_angles(bounds: Interval) -> Interval:
-    """Return an interval of the window error |v| as angles [arcsec]."""
-    if bounds is None:
-        return None
-    low, high = (ARCSEC * pointing_angle(bounds)).tolist()
-    return low, high
+def _to_arcsec(error: Any) -> Any:
+    """Return a window error |v| or an interval of errors as angles [arcsec]; None for None."""
+    return None if error is None else (ARCSEC * pointing_angle(error)).tolist()
 
 
 def _error_column(name: str, change: str) -> Value:
@@ -56,9 +48,9 @@ def _error_column(name: str, change: str) -> Value:
     return Value(
         name,
         "arcsec",
-        lambda law: _error_angle(law.model_errors[change].window_error) if change in law.model_errors else None,
+        lambda law: _to_arcsec(law.model_errors[change].window_error) if change in law.model_errors else None,
         interval=lambda law: (
-            _error_angles(law.model_errors[change].window_error_interval) if change in law.model_errors else None
+            _to_arcsec(law.model_errors[change].window_error_interval) if change in law.model_errors else None
         ),
     )
 
@@ -83,8 +75,8 @@ def _margin_column(name: str) -> Value:
 
 
 ERROR = Value(
-    "RMS pointing error", "arcsec", lambda law: _error_angle(law.window_error),
-    interval=lambda law: _error_angles(law.window_error_interval),
+    "RMS pointing error", "arcsec", lambda law: _to_arcsec(law.window_error),
+    interval=lambda law: _to_arcsec(law.window_error_interval),
 )  # fmt: skip
 BOUND = Value("ratio to the lower bound", "", lambda law: ratio_to_bound(law.window_error, law.lower_bound))
 CHANGES = {
@@ -149,15 +141,15 @@ QUESTIONS = (
 
 
 def build(summary: Compare) -> Report:
-    """Return the report of a comparison; it has the charts that the page draws."""
+    """Return the report of a comparison."""
     headline = {
         "met": "The tuned law of the paper meets every requirement",
         "not met": "The tuned law of the paper does NOT meet every requirement",
     }.get(summary.status, "Interrupted: the best result so far")
     sections = [
-        Section(question.title, [_draw_answers(question, summary.laws, k), answer_table(question, summary.laws)])
-        for k, question in enumerate(QUESTIONS)
-        if any(value.read(law) is not None for value in question.values for law in summary.laws.values())
+        Section(question.title, [answer_table(question, summary.laws)])
+        for question in QUESTIONS
+        if _has_answer(question, summary.laws)
     ]
     method = (
         "the same search tuned each law in all of its gains, the scenario's own law in those of tune.free; results on "
@@ -168,22 +160,33 @@ def build(summary: Compare) -> Report:
     return Report(headline, mood, [most_accurate_law(summary.laws), method, *warning_lines(summary.warnings)], sections)
 
 
-def _draw_answers(question: Question, laws: dict[str, Law], number: int) -> Chart:
-    shown = question.values[: question.drawn]
-    series = {
-        value.name: ([value.read(law) for law in laws.values()], [value.interval(law) for law in laws.values()])
-        for value in shown
-    }
-    axis = f"{question.axis_label or shown[0].name} [{shown[0].unit}]"
-    names = [_readable_name(law) for law in laws]
-    figure = page_charts.laws(names, series, axis, reference_lines(question, list(laws.values())), question.logarithmic)
-    return Chart(f"question_{number}", figure, question.note)
+def _has_answer(question: Question, laws: dict[str, Law]) -> bool:
+    return any(value.read(law) is not None for value in question.values for law in laws.values())
+
+
+def charts(laws: dict[str, Law]) -> dict[str, list[Block]]:
+    """Return the charts of the page by the titles of their sections."""
+    from tuning.output import page_charts  # imports Matplotlib, which the terminal does not need
+
+    names, charts_by_title = [_readable_name(law) for law in laws], dict[str, list[Block]]()
+    for number, question in enumerate(QUESTIONS):
+        if _has_answer(question, laws):
+            shown = question.values[: question.drawn]
+            series = {
+                value.name: ([value.read(law) for law in laws.values()], [value.interval(law) for law in laws.values()])
+                for value in shown
+            }
+            axis = f"{question.axis_label or shown[0].name} [{shown[0].unit}]"
+            marks = reference_lines(question, list(laws.values()))
+            figure = page_charts.laws(names, series, axis, marks, question.logarithmic)
+            charts_by_title[question.title] = [Chart(f"question_{number}", figure, question.note)]
+    return charts_by_title
 
 
 def reference_lines(question: Question, laws: list[Law]) -> dict[str, float]:
     """Return the lines of a chart: the smallest lower bound of the laws, or a required limit."""
     if question.judged:
-        bounds = [bound for law in laws if (bound := _error_angle(law.lower_bound))]
+        bounds = [bound for law in laws if (bound := _to_arcsec(law.lower_bound))]
         return {"lower bound": min(bounds)} if bounds else {}
     limits = {verdict.metric: verdict.limit for law in laws for verdict in law.verdicts}
     return {"limit": limits[question.limit]} if question.limit in limits else {}
@@ -203,7 +206,10 @@ def answer_table(question: Question, laws: dict[str, Law]) -> Table:
             bounds = first.interval(law)
             cells.insert(1, "-" if bounds is None else f"{format_ratio(bounds[0])} to {format_ratio(bounds[1])}")
         if question.judged:
-            violations = {verdict.metric: _count_violations(verdict) for verdict in law.verdicts}
+            violations = {
+                verdict.metric: f"{verdict.failures} of {verdict.trials}" + ("" if verdict.met else ": NOT met")
+                for verdict in law.verdicts
+            }
             cells += [*(violations.get(metric, "-") for metric in required), "yes" if law.met else "no"]
         rows.append((_readable_name(name), *cells))
     if with_interval:
@@ -211,10 +217,6 @@ def answer_table(question: Question, laws: dict[str, Law]) -> Table:
     if question.judged:
         head += [*(f"trials beyond {metric}" for metric in required), "all limits met"]
     return Table(("", *head), rows)
-
-
-def _count_violations(verdict: Entry) -> str:
-    return f"{verdict.failures} of {verdict.trials}" + ("" if verdict.met else ": NOT met")
 
 
 def format_answer(value: Value, law: Law) -> str:
@@ -256,7 +258,7 @@ def gain_lines(summary: Compare) -> Iterator[str]:
 def most_accurate_law(laws: dict[str, Law]) -> str:
     """Return the most accurate law that meets every requirement, and the ratio of the paper's law to it."""
     errors = {
-        name: error for name, law in laws.items() if law.met and (error := _error_angle(law.window_error)) is not None
+        name: error for name, law in laws.items() if law.met and (error := _to_arcsec(law.window_error)) is not None
     }
     if not errors:
         return "no law meets every requirement"

@@ -22,13 +22,51 @@ from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.scenario import parsing
 from tuning.errors import UsageError
-from tuning.output import campaign_report, page_captions, page_charts, reports
-from tuning.output.report import Block, Chart, Code, Picture, Report, Section, Table
+from tuning.output import campaign_report, compare_report, page_charts, reports, summaries
+from tuning.output.report import Block, Chart, Code, Picture, Section, Table
 from tuning.studies import front
 
 HERE = Path(__file__).parent
 INPUT_FILES = ("versions.json", store.SUMMARY, "scenario.toml", "trajectory.csv", "history.csv", "map.csv")  # to read
 PNG_HEADER = b"\x89PNG\r\n\x1a\n"  # first bytes of a PNG file
+# caption of the scenario in a page, by command: whose gains it has
+SCENARIO_NOTES = {
+    "tune": "These are the gains before the search; tuned.toml is the same scenario with the tuned gains.",
+    "pareto": "These are the gains before the search; the table above has the gains of each point.",
+    "compare": "These are the gains before the search; the gains of each law are listed above.",
+}
+# captions of the figures
+CAPTIONS = {
+    "history": "Gains and objective of every starting point over the steps of the local search.",
+    "tradeoff": "Peak torque and error after t_f of each held-out trial.",
+    "sensitivities": "Change of each metric in per cent for one per cent of each gain.",
+    "profiles": "The objective along each gain between its bounds, with the other gains as found; marked points break "
+    "a limit.",
+    "front": "The front of accuracy against peak torque.",
+    "slew_times": "The error and the costs of the slew over the prescribed time; open points break a requirement.",
+    "robustness": "The error, the torque and the margins over the limit on the peak sensitivity; open points break "
+    "a requirement.",
+    "map": "Error and peak torque over the two keys, with the stability limits of the loop.",
+    "nichols": "The open loop at each axis of the plant's input, the others closed.",
+    "sensitivity": "Transfer of disturbances (S) and noise (T) over the frequency.",
+    "margins": "Margins of the nominal loop in the approach phase, with its gains frozen.",
+    "fan": "The error over time: the fraction of trials inside each band.",
+    "distributions": "The fraction of the trials up to each value; the scale stretches both ends.",
+    "inputs": "Metrics (up) over the sampled inputs (across), a point for each trial; limits are dashed.",
+    "wheels": "Momentum of each reaction wheel over time.",
+    "wheel_torque": "Torque of each reaction wheel over time.",
+    "disturbance": "The disturbance as the observer estimates it; the true one is black.",
+    "torque_by_angle": "Peak torque over the initial angle from the reference.",
+    "settling": "Settling time over the initial angle from the reference.",
+    "error": "Attitude error, or the first state, over time.",
+    "sliding": "Sliding variable over time.",
+    "convergence": "Error and sliding variable over the time to go; dotted: the exact motion; black: the slopes of the "
+    "theory.",
+    "torque": "Delivered torque over time.",
+    "attitude": "Attitude over time.",
+    "rate": "Body rate over time.",
+    "states": "States over time.",
+}
 
 
 @dataclass(frozen=True)
@@ -66,7 +104,7 @@ def read(folder: Path) -> Result:
         scenario = parsing.parse_toml(path.read_text(encoding="utf-8"), str(path)) if path.exists() else {}
     except FileNotFoundError:
         raise _unfinished_error(folder, versions) from None
-    except (ValueError, RecursionError) as error:
+    except (csv.Error, ValueError, RecursionError) as error:
         raise RefusedError(f"{folder} holds a file that cannot be read: {error}") from None
     return Result(folder, versions, summary, scenario)
 
@@ -98,13 +136,12 @@ def build(folder: Path) -> str:
     result = read(folder)
     try:
         from jinja2 import Environment
-        from markupsafe import Markup
         from plotly.offline import get_plotlyjs
     except ImportError as error:
         raise UsageError(f"the page needs {error.name}: pip install 'ptsmc-jax[report]'") from None
     try:
-        command = result.versions["command"]
-        report = _add_charts(reports.build(command, result.summary, result.plant), result)
+        report = reports.build(result.versions["command"], result.summary, result.plant)
+        charts = _charts(result)
     except FileNotFoundError:
         raise _unfinished_error(folder, result.versions) from None
     except (msgspec.ValidationError, KeyError, AttributeError, TypeError) as error:
@@ -112,45 +149,41 @@ def build(folder: Path) -> str:
         raise RefusedError(f"{folder} holds a summary of another version ({version}): {error}; make it again") from None
     except (csv.Error, IndexError, ValueError) as error:  # for example, a CSV file is truncated
         raise RefusedError(f"{folder} holds a file that cannot be read: {error}") from None
-    sections = [*report.sections, *_figure_sections(result), *_origin_sections(result)]
-    charts_by_name = {
-        block.name: block.figure for section in sections for block in section.blocks if isinstance(block, Chart)
-    }
-    drawing_script = (HERE / "page.js").read_text(encoding="utf-8")
-    library = get_plotlyjs() if charts_by_name else ""
-    scripts = (
-        " ".join(f"'sha256-{_policy_checksum(script)}'" for script in (library, drawing_script))
-        if charts_by_name
-        else "'none'"
-    )
-    # < is escaped, so that no text in the data can close the HTML element
-    charts = json.dumps(charts_by_name, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    sections = [
+        *(replace(section, blocks=[*charts.pop(section.title, []), *section.blocks]) for section in report.sections),
+        *(Section(title, blocks) for title, blocks in charts.items()),
+        *_figure_sections(result),
+        *_origin_sections(result),
+    ]
+    figures = {block.name: block.figure for section in sections for block in section.blocks if isinstance(block, Chart)}
+    scripts = [get_plotlyjs(), (HERE / "page.js").read_text(encoding="utf-8")] if figures else []
+    checksums = [
+        base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii") for script in scripts
+    ]
+    allowed = " ".join(f"'sha256-{checksum}'" for checksum in checksums) or "'none'"
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string((HERE / "page.html").read_text(encoding="utf-8"))
     return template.render(
         title=f"ptsmc {result.versions['command']}: {folder.resolve().name}",
         report=report,
         sections=sections,
-        policy=Markup(f"default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; script-src {scripts}"),
-        style=Markup((HERE / "page.css").read_text(encoding="utf-8")),
-        charts=Markup(charts) if charts_by_name else "",
-        library=Markup(library),
-        drawing=Markup(drawing_script),
+        policy=f"default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; script-src {allowed}",
+        style=(HERE / "page.css").read_text(encoding="utf-8"),
+        # < is escaped, so that no text in the data can close the HTML element
+        figures=json.dumps(figures, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
+        scripts=scripts,
     )
-
-
-def _policy_checksum(script: str) -> str:
-    """Return the SHA-256 of a script in base64, as the page's Content-Security-Policy lists allowed scripts."""
-    return base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii")
 
 
 def _history_charts(result: Result) -> list[Block]:
     """Return the charts of a run."""
-    columns = page_charts.read_trajectory(result.folder / "trajectory.csv")
+    head, *rows = _read_rows(result.folder / "trajectory.csv")
+    values = np.array([[float(cell or "nan") for cell in row] for row in rows])
+    columns = dict(zip(head, values.T, strict=True))
     law = result.scenario["controller"]
-    marks = {"t_f": law["t_f"], **({"t_f - delta": law["t_f"] - law["delta"]} if "delta" in law else {})}
-    if "delta" in law and law["delta"] < 0.05 * columns["t"][-1]:  # the labels of t_f - delta and t_f would overlap
-        del marks["t_f - delta"]
+    marks = {"t_f": law["t_f"]}
+    if law.get("delta", 0.0) >= 0.05 * columns["t"][-1]:  # otherwise the labels of t_f - delta and t_f overlap
+        marks["t_f - delta"] = law["t_f"] - law["delta"]
     spacecraft = result.plant == "spacecraft"
     caption = "Drag to zoom, double-click to see all; the dotted lines are the hand-over and t_f."
     charts: list[Block] = [Chart("history", page_charts.history(columns, spacecraft, marks), caption, "tall")]
@@ -177,19 +210,20 @@ def _front_chart(result: Result) -> Chart:
     return Chart("front", page_charts.front(front.read(result.summary), limit), caption)
 
 
-def _add_charts(report: Report, result: Result) -> Report:
-    """Return a report with the charts and the table that only the page shows."""
-    command, sections = result.versions["command"], report.sections
+def _charts(result: Result) -> dict[str, list[Block]]:
+    """Return the charts and the table that only the page shows, by the titles of their sections."""
+    command = result.versions["command"]
     if command == "simulate":
-        sections = [*sections, Section("History", _history_charts(result))]
-    elif command == "tune":
-        sections = [*sections, Section("Search", [_search_chart(result)])]
-    elif command == "montecarlo":
-        gains = campaign_report.gain_table(result.scenario, result.plant)
-        sections = [*sections, Section("Gains", [gains])]
-    elif command == "pareto" and result.summary["against"] == "torque":
-        sections = [replace(section, blocks=[_front_chart(result), *section.blocks]) for section in sections]
-    return replace(report, sections=sections)
+        return {"History": _history_charts(result)}
+    if command == "tune":
+        return {"Search": [_search_chart(result)]}
+    if command == "montecarlo":
+        return {"Gains": [campaign_report.gain_table(result.scenario, result.plant)]}
+    if command == "compare":
+        return compare_report.charts(summaries.read(summaries.Compare, result.summary).laws)
+    if command == "pareto" and result.summary["against"] == "torque":
+        return {front.KINDS["torque"].title: [_front_chart(result)]}
+    return {}
 
 
 def _figure_sections(result: Result) -> Iterator[Section]:
@@ -203,7 +237,7 @@ def _figure_sections(result: Result) -> Iterator[Section]:
             print(f"ptsmc: {path} {reason}, and is not in the page", file=sys.stderr)
             continue
         source = "data:image/png;base64," + base64.b64encode(content).decode("ascii")
-        pictures.append(Picture(path.stem.replace("_", " "), source, page_captions.CAPTIONS.get(path.stem, "")))
+        pictures.append(Picture(path.stem.replace("_", " "), source, CAPTIONS.get(path.stem, "")))
     if pictures:
         yield Section("Figures", pictures)
 
@@ -213,7 +247,7 @@ def _origin_sections(result: Result) -> Iterator[Section]:
     versions = result.versions
     path = result.folder / "scenario.toml"
     if path.exists():
-        note = page_captions.SCENARIO.get(versions["command"], "")
+        note = SCENARIO_NOTES.get(versions["command"], "")
         yield Section("Scenario", [Code(path.read_text(encoding="utf-8"), note)])
     command_line = versions.get(store.COMMAND_LINE, "")
     yield Section("How to make this again", [Code(command_line, "In the folder where it was called.")])

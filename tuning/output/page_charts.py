@@ -1,8 +1,6 @@
 """Interactive charts of a result, as Plotly's JSON: histories, a turning body, a front, a search."""
 
-import csv
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,14 +33,6 @@ def _layout(**others: Any) -> Chart:
         "legend": {"orientation": "h", "y": 1.02, "yanchor": "bottom"},
         **others,
     }
-
-
-def read_trajectory(path: Path) -> dict[str, np.ndarray]:
-    """Return the numbers of a `trajectory.csv` by the names of its columns, (time,) each."""
-    with path.open(newline="", encoding="utf-8") as file:
-        head, *rows = csv.reader(file)
-    values = np.array([[float(cell or "nan") for cell in row] for row in rows])
-    return dict(zip(head, values.T, strict=True))
 
 
 LOG_COLUMNS = ("measured", "sent")  # columns for `ptsmc identify`, which have gaps
