@@ -13,7 +13,8 @@ from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.catalogues import percent
 from tests.helpers import rows_of, short
 from tests.output.pages import checked
-from tuning.output import formats, pointing_report, summaries
+from tuning.output import campaign_report, formats, summaries
+from tuning.output.report import Table
 
 ASKED = """
 [pointing]
@@ -98,8 +99,9 @@ def test_pointing_requirements_have_verdicts_budget_and_table(simulated, tmp_pat
         assert "from 0.5 s after t_f to t_end, with 95 % confidence; boresight 1, 0, 0" in place
         assert "an angle is - without 1109 runs that all reach their end (852 for 90 % confidence)" in place
         assert "ape_boresight at most 2062.65 arcsec in 50 % of the time of all runs" in place
-    table = pointing_report.compliance_table(summaries.read(summaries.Campaign, found))
-    assert table is not None
+    (section,) = campaign_report.pointing_sections(summaries.read(summaries.Campaign, found))
+    table = section.blocks[-1]
+    assert isinstance(table, Table)
     assert [row[:7] for row in table.rows] == [
         ("RPE", "half-cone", "1.15 deg", "90 %", "ensemble", "90 %",
          formats.format_angle(ensemble["margin"] * 0.02)),
@@ -145,7 +147,7 @@ def test_pointing_budget_is_an_order_statistic(monkeypatch, simulated):
     least = next(k for k in range(1, 151) if statistics.fraction_bound(k, 150, 0.95) >= 0.9)
     assert again["mpe"]["y"] == ordered[least - 1]
     read = summaries.read(summaries.Campaign, {**found, "pointing": {**found["pointing"], "budget": again}})
-    assert formats.format_angle(again["mpe"]["y"]) in str(pointing_report.budget_table(read))
+    assert formats.format_angle(again["mpe"]["y"]) in str(campaign_report.pointing_sections(read))
 
 
 def test_single_run_has_the_pointing_indices(command, simulated, tmp_path):

@@ -24,7 +24,6 @@ from tuning.output import (
     front_report,
     margins_report,
     page_charts,
-    pointing_report,
     reports,
     summaries,
     trials_report,
@@ -329,7 +328,9 @@ def budget(simulated: int, ok: int, not_converged: int = 0) -> str:
     told = {"after": 0.0, "boresight": [1.0, 0.0, 0.0], "probability": 0.9973, "confidence": 0.95, "window": 1.0,
             "budget": {"ape": {"x": None}}}  # fmt: skip
     counts = {"ok": ok, "not_converged": not_converged}
-    return [*pointing_report.heading_lines(examples.campaign(pointing=told, simulated=simulated, counts=counts))][-1]
+    campaign = examples.campaign(pointing=told, simulated=simulated, counts=counts)
+    assert campaign.pointing is not None
+    return [*campaign_report.budget_lines(campaign, campaign.pointing)][-1]
 
 
 def winner(least: float) -> str:

@@ -1,4 +1,4 @@
-"""The report of a campaign: error, requirements, quantiles, and the inputs that drive the metrics."""
+"""The report of a campaign: error, requirements, quantiles, inputs that drive the metrics, and pointing budget."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -7,18 +7,27 @@ import msgspec
 
 from ptsmc_jax.numerics import statistics
 from ptsmc_jax.simulation import catalogues
-from ptsmc_jax.simulation.catalogues import percent
-from tuning.output import pointing_report, report
-from tuning.output.formats import format_count, format_named_error, format_number, list_counts
+from ptsmc_jax.simulation.catalogues import AXES, INDICES, percent
+from ptsmc_jax.simulation.requirements import fewest_trials
+from tuning.output import report
+from tuning.output.formats import format_angle, format_count, format_named_error, format_number, list_counts
 from tuning.output.report import Block, Report, Section, Table, Text
-from tuning.output.summaries import Campaign, Entry, Quantile
+from tuning.output.summaries import Campaign, Entry, Pointing
 
-NOTES = {
-    "max": "Quantiles with 95 % intervals; a failed trial is beyond every quantile. -: there is no value, "
-    "because too many trials fail or never settle, or too few were simulated.",
-    "min": "Fractions of the time within a limit, larger is better: the value that 99.73 % of the trials reach, and "
-    "the smallest. A failed trial counts as 0.",
+# head and note of the table of the metrics whose worst value is the largest or the smallest
+QUANTILE_TABLES = {
+    "max": (
+        ("", "median", "99.73 %", "its 95 % interval", "largest", "unit"),
+        "Quantiles with 95 % intervals; a failed trial is beyond every quantile. -: there is no value, "
+        "because too many trials fail or never settle, or too few were simulated.",
+    ),
+    "min": (
+        ("", "median", "99.73 % reach", "its 95 % interval", "smallest", "unit"),
+        "Fractions of the time within a limit, larger is better: the value that 99.73 % of the trials reach, and "
+        "the smallest. A failed trial counts as 0.",
+    ),
 }
+REVIEW_CONFIDENCES = (0.9, 0.95)  # confidences that reviews ask for
 
 
 def build(summary: Campaign) -> Report:
@@ -31,7 +40,7 @@ def build(summary: Campaign) -> Report:
     sections = [
         *report.requirement_sections(summary.verdicts, verdict_with_fraction),
         Section("Metrics", blocks),
-        *pointing_report.pointing_sections(summary),
+        *pointing_sections(summary),
     ]
     lines = [
         *report.bound_lines(error, summary.lower_bound, summary.plant),
@@ -84,29 +93,25 @@ def count_lines(summary: Campaign) -> Iterator[str]:
 
 def quantile_tables(summary: Campaign) -> list[Table]:
     """Return the quantiles of every metric; metrics that are better when larger have a table of their own."""
-    heads = {"max": ("", "median", "99.73 %", "its 95 % interval", "largest", "unit"),
-             "min": ("", "median", "99.73 % reach", "its 95 % interval", "smallest", "unit")}  # fmt: skip
-    tables = [Table(head, _quantile_rows(summary, bad_end), NOTES[bad_end]) for bad_end, head in heads.items()]
-    return [table for table in tables if table.rows]
-
-
-def _quantile_rows(summary: Campaign, bad_end: str) -> list[tuple[str, ...]]:
-    """Return the rows of the metrics whose bad end is "max" or "min"."""
-    rows: list[tuple[str, ...]] = []
-    units = catalogues.units(summary.plant)
+    units, tables = catalogues.units(summary.plant), []
     failed = sum(count for status, count in summary.counts.items() if status not in ("ok", "not_converged"))
-    for name, metric_quantiles in summary.quantiles.items():
-        tail: Quantile | None = metric_quantiles.high if bad_end == "max" else metric_quantiles.low
-        if pointing_report.is_index(name) or tail is None:
-            continue
-        has_missing_values = (
-            metric_quantiles.without_value > failed
-        )  # trials without a value, such as runs that end but never settle
-        largest = "none" if has_missing_values else format_number(getattr(metric_quantiles, bad_end), ".3g")
-        tail_interval = f"{format_number(tail.low, '.3g')}..{format_number(tail.high, '.3g')}"
-        values = (format_number(metric_quantiles.median.value, ".3g"), format_number(tail.value, ".3g"))
-        rows.append((name, *values, tail_interval, largest, units.get(name, "")))
-    return rows
+    for worst, (head, note) in QUANTILE_TABLES.items():
+        rows = []
+        for name, quantiles in summary.quantiles.items():
+            tail = quantiles.high if worst == "max" else quantiles.low
+            if _is_pointing_index(name) or tail is None:
+                continue
+            has_missing_values = quantiles.without_value > failed  # for example of runs that end but never settle
+            numbers = (
+                format_number(quantiles.median.value, ".3g"),
+                format_number(tail.value, ".3g"),
+                f"{format_number(tail.low, '.3g')}..{format_number(tail.high, '.3g')}",
+                "none" if has_missing_values else format_number(getattr(quantiles, worst), ".3g"),
+            )
+            rows.append((name, *numbers, units.get(name, "")))
+        if rows:
+            tables.append(Table(head, rows, note))
+    return tables
 
 
 def driver_lines(summary: Campaign) -> Iterator[str]:
@@ -136,6 +141,83 @@ def driver_lines(summary: Campaign) -> Iterator[str]:
     if unexplained:
         threshold = f"{100 * statistics.MIN_EXPLAINED:g} % of the variance of the ranks"
         yield f"no dispersed quantity alone explains {threshold} of {', '.join(unexplained)}"
+
+
+def pointing_sections(summary: Campaign) -> list[Section]:
+    """Return the section with the pointing budget and its compliance, none if the campaign observes no pointing."""
+    blocks: list[Block] = []
+    if summary.pointing is not None:
+        blocks = [Text(list(budget_lines(summary, summary.pointing))), budget_table(summary.pointing)]
+    rows = [_compliance_row(verdict) for verdict in summary.verdicts if _is_pointing_index(verdict.metric)]
+    if rows:
+        head = ("index", "about", "at most", "probability", "interpretation", "confidence", "shown", "runs", "beyond",
+                "enough if none", "verdict")  # fmt: skip
+        blocks.append(Table(head, rows))
+    return [Section("Pointing", blocks)] if blocks else []
+
+
+def _is_pointing_index(metric: str) -> bool:
+    index, _, axis = metric.rpartition("_")
+    return index in INDICES and axis in AXES
+
+
+def budget_lines(summary: Campaign, pointing: Pointing) -> Iterator[str]:
+    """Return the probability and the confidence of the pointing budget, and the reason for missing values."""
+    boresight = ", ".join(f"{v:g}" for v in pointing.boresight)
+    begins = f"{pointing.after:g} s after t_f" if pointing.after else "t_f"
+    yield (
+        f"{100 * pointing.probability:g} % of the runs stay within the angles of this budget from {begins} to t_end, "
+        f"with {100 * pointing.confidence:g} % confidence; boresight {boresight}"
+    )
+    if any(value is None for axes in pointing.budget.values() for value in axes.values()):
+        few, many = (fewest_trials(pointing.probability, confidence) for confidence in REVIEW_CONFIDENCES)
+        # runs that ended early have no angles
+        ended_early = summary.simulated - summary.counts["ok"] - summary.counts.get("not_converged", 0)
+        if summary.simulated >= many and ended_early:
+            yield f"an angle is - because {ended_early} runs did not reach their end"
+        else:
+            yield f"an angle is - without {many} runs that all reach their end ({few} for 90 % confidence)"
+
+
+def budget_table(pointing: Pointing) -> Table:
+    """Return the angles of each index about the axes and as a half-cone."""
+    rows = []
+    for index, angles in pointing.budget.items():
+        name, _, meaning = INDICES[index].partition(", ")
+        meaning_text = f"{meaning} ({pointing.window:g} s)" if "window" in meaning else meaning
+        rows.append((name, *(format_angle(angles.get(axis)) for axis in AXES), meaning_text))
+    return Table(("index", "x", "y", "z", "half-cone", "largest in the observation of"), rows)
+
+
+def _compliance_row(verdict: Entry) -> tuple[str, ...]:
+    """Return a requirement on pointing in the form that reviews use."""
+    index, _, axis = verdict.metric.rpartition("_")
+    if verdict.interpretation == "ensemble":
+        demonstrated = format_angle(None if verdict.margin is None else verdict.margin * verdict.limit)
+    else:
+        demonstrated = "-" if verdict.shown is None else f"{percent(verdict.shown)} % of the time"
+    return (
+        INDICES[index].partition(",")[0],
+        "half-cone" if axis == "boresight" else axis,
+        format_angle(verdict.limit),
+        "every run" if verdict.quantile is None else f"{100 * verdict.quantile:g} %",
+        verdict.interpretation,
+        "not required" if verdict.confidence is None else f"{100 * verdict.confidence:g} %",
+        demonstrated,
+        str(verdict.trials),
+        str(verdict.failures),
+        _runs_needed(verdict),
+        "met" if verdict.met else "NOT met",
+    )
+
+
+def _runs_needed(verdict: Entry) -> str:
+    """Return the number of runs without a failure that demonstrates the requirement."""
+    if verdict.quantile is None or verdict.interpretation == "temporal":
+        return "every run"
+    if verdict.confidence is not None:
+        return str(fewest_trials(verdict.quantile, verdict.confidence))
+    return ", ".join(f"{fewest_trials(verdict.quantile, c)} ({100 * c:g} %)" for c in REVIEW_CONFIDENCES)
 
 
 def gain_table(scenario: dict[str, Any], plant: str) -> Table:
