@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 from tuning.output.formats import format_error, format_ratio, ratio_to_bound
 
@@ -18,8 +18,6 @@ class Table:
     rows: list[tuple[str, ...]]
     note: str = ""
 
-    kind: ClassVar[str] = "table"
-
     @property
     def shape(self) -> str:
         """Return "numbers" if the last column contains numbers; a last column of remarks has no heading."""
@@ -33,8 +31,6 @@ class Text:
 
     lines: list[str]
 
-    kind: ClassVar[str] = "text"
-
 
 @dataclass(frozen=True)
 class Bars:
@@ -43,17 +39,6 @@ class Bars:
     verdicts: "list[Entry]"
     lines: list[str]
     note: str = "The line is the limit; a bar that ends before it keeps the limit."
-
-    kind: ClassVar[str] = "bars"
-
-    @property
-    def bars(self) -> list[dict[str, Any]]:
-        """Return the label, text and width of each bar. The chart is 400 wide, and the limit is at 300."""
-        return [
-            {"label": entry.metric.replace("_", " "), "text": text, "met": entry.met, "limit": 300,
-             "width": 400.0 if entry.margin is None else round(min(400.0, 300.0 * entry.margin), 1)}
-            for entry, text in zip(self.verdicts, self.lines, strict=True)
-        ]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -65,8 +50,6 @@ class Chart:
     caption: str
     shape: str = ""
 
-    kind: ClassVar[str] = "chart"
-
 
 @dataclass(frozen=True)
 class Picture:
@@ -76,8 +59,6 @@ class Picture:
     source: str
     caption: str
 
-    kind: ClassVar[str] = "picture"
-
 
 @dataclass(frozen=True)
 class Code:
@@ -85,8 +66,6 @@ class Code:
 
     text: str
     note: str = ""
-
-    kind: ClassVar[str] = "code"
 
 
 Block = Table | Text | Bars | Chart | Picture | Code
