@@ -3,8 +3,6 @@
 from collections.abc import Iterator
 from typing import Any
 
-import msgspec
-
 from ptsmc_jax.numerics import statistics
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.catalogues import AXES, INDICES, percent
@@ -76,16 +74,12 @@ def count_lines(summary: Campaign) -> Iterator[str]:
     for reason in summary.reasons:
         first_time = "" if reason.first_bad_time is None else f", the first at {reason.first_bad_time:.4g} s"
         yield f"  {reason.trials} {reason.status}: {reason.reason}{first_time}"
-    controller_samples = {
-        status: status_samples
-        for status, status_samples in summary.controller_samples.items()
-        if status_samples.samples
-    }
-    if controller_samples:
-        numbers = (
-            f"{status_samples.samples} {status} in {format_count(status_samples.trials, 'trial')}"
-            for status, status_samples in controller_samples.items()
-        )
+    numbers = [
+        f"{count['samples']} {status} in {format_count(count['trials'], 'trial')}"
+        for status, count in summary.controller_samples.items()
+        if count["samples"]
+    ]
+    if numbers:
         yield f"samples of the controller: {', '.join(numbers)}"
     if summary.run_table:
         yield "fractions, quantiles and intervals assume random trials; they hold as far as the run table is random"
@@ -123,14 +117,14 @@ def driver_lines(summary: Campaign) -> Iterator[str]:
     for metric in dict.fromkeys(("window_error", *(one.metric for one in summary.verdicts))):
         sensitivities = summary.drivers.get(metric, {})
         explained = {
-            name: statistics.explained_variance(msgspec.structs.asdict(driver), summary.driver_trials[metric])
+            name: statistics.explained_variance(driver, summary.driver_trials[metric])
             for name, driver in sensitivities.items()
         }
         strongest = sorted((name for name in explained if explained[name] >= statistics.MIN_EXPLAINED),
                            key=lambda name: -explained[name])[:3]  # fmt: skip
         texts = []
         for name in strongest:
-            rank = sensitivities[name].rank_correlation
+            rank = sensitivities[name]["rank_correlation"]
             # the number of a wheel has no rank correlation
             correlation = "" if rank is None else f"rank correlation {rank:+.2f}, "
             texts.append(f"{name} ({correlation}{100 * explained[name]:.0f} % of the variance of the ranks)")

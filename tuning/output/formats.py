@@ -46,13 +46,10 @@ def format_angle(value: float | None) -> str:
     if value is None or not math.isfinite(value):
         return "-"
     degrees = math.degrees(value)
-    return f"{degrees:.3g} deg" if abs(degrees) >= 1.0 else f"{format_arcsec(degrees)} arcsec"
-
-
-def format_arcsec(degrees: float) -> str:
-    """Return an angle below one degree [deg] as a number of arcsec."""
-    value = 3600.0 * degrees
-    return f"{value:.0f}" if abs(value) >= 999.5 else f"{value:.3g}"
+    if abs(degrees) >= 1.0:
+        return f"{degrees:.3g} deg"
+    arcsec = 3600.0 * degrees
+    return f"{arcsec:.0f} arcsec" if abs(arcsec) >= 999.5 else f"{arcsec:.3g} arcsec"
 
 
 def format_error(value: float | None, plant: str) -> str:

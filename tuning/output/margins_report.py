@@ -79,13 +79,10 @@ def _open_loop_lines(summary: Margins) -> Iterator[str]:
         (True, "a limit of the actuators cuts the command of the nominal run"),
         (False, "the controller does not react to the state at this sample"),
     ):
-
-        def select_inputs(names: list[str], cut: list[str], by_limit: bool = by_limit) -> list[str]:
-            return [name for name in names if (name in cut) == by_limit]
-
-        inputs = select_inputs(summary.open, summary.cut)
-        places = {"in the hold phase": inputs}
-        loops = {loop.time_to_go: select_inputs(loop.open, loop.cut) for loop in summary.before}
+        places = {"in the hold phase": [name for name in summary.open if (name in summary.cut) == by_limit]}
+        loops = {
+            loop.time_to_go: [name for name in loop.open if (name in loop.cut) == by_limit] for loop in summary.before
+        }
         times = sorted(time for time, names in loops.items() if names)
         if times:
             inputs = list(dict.fromkeys(name for names in loops.values() for name in names))

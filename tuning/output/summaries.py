@@ -279,20 +279,6 @@ class Reason(msgspec.Struct, frozen=True):
     first_bad_time: Number
 
 
-class Driver(msgspec.Struct, frozen=True):
-    """The correlation of a metric with a dispersed input, see `statistics.drivers`."""
-
-    rank_correlation: Number
-    first_order: Number
-
-
-class Samples(msgspec.Struct, frozen=True):
-    """Number of controller samples that ended with a status, and number of trials with such a sample."""
-
-    samples: int
-    trials: int
-
-
 class Pointing(msgspec.Struct, frozen=True):
     """The pointing budget of a campaign."""
 
@@ -319,9 +305,9 @@ class Campaign(msgspec.Struct, frozen=True, kw_only=True):
     lower_bound: Number
     verdicts: list[Entry]
     quantiles: dict[str, Quantiles]
-    drivers: dict[str, dict[str, Driver]]
+    drivers: dict[str, dict[str, Numbers]]  # metric -> input -> sensitivities, see `statistics.drivers`
     driver_trials: dict[str, int]
-    controller_samples: dict[str, Samples] = {}
+    controller_samples: dict[str, dict[str, int]] = {}  # status -> number of samples, and of trials with such a sample
     pointing: Pointing | None = None
     warnings: list[str]
 

@@ -46,17 +46,12 @@ def build(summary: Tune) -> Report:
     return Report(headline, mood, [*accuracy_lines(summary), *report.warning_lines(summary.warnings)], sections)
 
 
-def _gain_columns(summary: Tune) -> dict[str, Group]:
-    """Return the gains side by side, by the headings of their columns."""
-    groups = {summary.published_label: summary.published, "before": summary.before, "tuned": summary.held_out}
-    return {name: group for name, group in groups.items() if group is not None}
-
-
 def gain_table(summary: Tune) -> Table:
     """Return the table of the gains that differ, and of the results of all of them on the held-out trials."""
     from ptsmc_jax.simulation.gains import base
 
-    columns, plant = _gain_columns(summary), summary.plant
+    groups = {summary.published_label: summary.published, "before": summary.before, "tuned": summary.held_out}
+    columns, plant = {name: group for name, group in groups.items() if group is not None}, summary.plant
     quantity, rows = formats.error_name(plant), list[tuple[str, ...]]()
     for gain in dict.fromkeys(name for group in columns.values() for name in group.gains):
         values = [group.gains.get(gain, group.gains.get(base(gain))) for group in columns.values()]
@@ -89,26 +84,19 @@ def gain_table(summary: Tune) -> Table:
 def accuracy_lines(summary: Tune) -> Iterator[str]:
     """Return lines that compare the error with the lower bound and with the error of the published gains."""
     held_out, plant = summary.held_out, summary.plant
-
-    def format_rms_error(value: float) -> str:
-        return format_error(value, plant)
-
     if summary.status == "interrupted":
         yield "these are the best gains so far; the same command resumes the search"
     failures = failed_counts(held_out.counts)
     if failures:
         count = sum(failures.values())
         yield f"{count} of {held_out.trials} held-out trials fail with the tuned gains: {list_counts(failures)}"
-    on_held_out, on_training = held_out.metrics.get("window_error"), summary.training.metrics.get("window_error")
-    if on_held_out is not None and on_held_out.rms is not None:
-        error_ratio = ratio_to_bound(on_held_out.rms, held_out.lower_bound)
-        lower_bound = format_error(held_out.lower_bound, plant)
-        bound = "" if error_ratio is None else f", {format_ratio(error_ratio)} times the lower bound of {lower_bound}"
-        spread = format_interval(on_held_out.rms_interval, format_rms_error)
-        yield f"held-out trials: {format_rms_error(on_held_out.rms)}{spread}{bound}"
-    if on_training is not None and on_training.rms is not None:
-        spread = format_interval(on_training.rms_interval, format_rms_error)
-        yield f"training trials: {format_rms_error(on_training.rms)}{spread}"
+    for name, group in (("held-out", held_out), ("training", summary.training)):
+        statistics = group.metrics.get("window_error")
+        if statistics is not None and statistics.rms is not None:
+            ratio, bound = ratio_to_bound(statistics.rms, group.lower_bound), format_error(group.lower_bound, plant)
+            compared = "" if ratio is None else f", {format_ratio(ratio)} times the lower bound of {bound}"
+            spread = format_interval(statistics.rms_interval, lambda value: format_error(value, plant))
+            yield f"{name} trials: {format_error(statistics.rms, plant)}{spread}{compared}"
     yield from _published_comparison(summary)
     if summary.gains:
         yield f"tuned gains: {', '.join(f'{name} {value:.6g}' for name, value in summary.gains.items())}"
