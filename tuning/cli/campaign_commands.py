@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Group, Parameter
 from cyclopts.validators import MutuallyExclusive, Number
 
-from tuning.cli import flight_commands, searches
+from tuning.cli import searches
 from tuning.cli.options import (
     USUAL,
     Common,
+    ControllerFolder,
     Device,
     Figures,
     Out,
@@ -102,7 +103,7 @@ def montecarlo(
             help="Write the run table of the trials into DIR/runs, and simulate nothing.",
         ),
     ] = False,
-    controller: flight_commands.ControllerFolder = None,
+    controller: ControllerFolder = None,
     common: Common = USUAL,
 ) -> int:
     """Simulate many dispersed trials and write one row for each. `ptsmc replay` repeats any trial.
@@ -134,7 +135,7 @@ def montecarlo(
         if is_refused:
             raise UsageError(message)
     bits = 32 if precision == "32" else 64
-    loaded, path = prepare(scenario, "montecarlo", out, device, bits, trust=common.trust)
+    loaded, path = prepare(scenario, "montecarlo", out, device, bits, trust=common.trust, in_c=controller is not None)
     from ptsmc_jax.campaigns import store
     from ptsmc_jax.simulation import catalogues
 
@@ -142,7 +143,6 @@ def montecarlo(
         raise UsageError("--until-confident needs [requirements] on metrics in the scenario")
     from tuning.studies import campaign_folder
 
-    loaded = loaded if controller is None else flight_commands.on_flight_clock(loaded)
     folder = campaign_folder.Folder(
         path, loaded, seed, 10_000 if trials is None else trials, metrics, bits, controller=controller
     )
@@ -161,8 +161,8 @@ def montecarlo(
 
         folder = replace(folder, first_look=campaign_summary.choose_first_look(folder, common.force))
     _ = folder.campaign  # raises configuration errors before anything is written
-    if folder.computer is not None:
-        flight_commands.report_parameter_differences(folder.computer)
+    if folder.parameter_differences:
+        print(f"ptsmc: {folder.parameter_differences}", file=sys.stderr)
 
     shared = this_shard != (1, 1) and not dry_run
     with (
@@ -328,10 +328,8 @@ def replay(
         origin = {"campaign": str(folder.absolute()), "metrics": campaign.custom_metrics} if needs_campaign else {}
         store.write_folder(replay_folder, lambda staging: single.write(staging, *run_details, origin))
     if not common.quiet:
-        from tuning.output import reports
-
         summary = single.summary(repeated.run, campaign.scenario, campaign.computer)
-        terminal.print_report(reports.build("simulate", summary, campaign.scenario.plant.kind), replay_folder)
+        terminal.print_result("simulate", summary, campaign.scenario.plant.kind, replay_folder)
         terminal.print_lines(
             *trials_report.replay_lines(repeated.difference, repeated.rounding, campaign_summary.TOLERANCE)
         )
@@ -355,9 +353,7 @@ def _summarise(folder: "Folder", quiet: bool, figures: bool, *, write: bool = Tr
         if write:
             campaign_summary.write_summary(folder, summary, figures)
     if not quiet:
-        from tuning.output import reports
-
-        terminal.print_report(reports.build("montecarlo", summary, folder.scenario.plant.kind), folder.path)
+        terminal.print_result("montecarlo", summary, folder.scenario.plant.kind, folder.path)
     return 0 if summary["status"] == "met" else 1
 
 

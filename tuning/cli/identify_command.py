@@ -56,7 +56,6 @@ def identify(
     from ptsmc_jax.campaigns import store
     from ptsmc_jax.identification import design as designing
     from ptsmc_jax.identification import estimation, results, telemetry
-    from tuning.output import reports
     from tuning.studies import identifying
 
     if design:
@@ -67,7 +66,8 @@ def identify(
             write = identifying.write_design
             store.write_folder(folder, lambda staging: write(staging, loaded, profile, common.figures, settings))
         if not common.quiet:
-            terminal.print_report(reports.identify_report(identifying.design_summary(profile, settings)), folder)
+            summary = identifying.design_summary(profile, settings)
+            terminal.print_result("identify", summary, loaded.plant.kind, folder)
         return 0
     fitted, predicted = (
         [telemetry.measurements(loaded, telemetry.read(path), path.name) for path in paths]
@@ -79,7 +79,7 @@ def identify(
         made_by = {"logs": [str(path) for path in logs], "validate": [str(path) for path in validate]}
         store.write_folder(folder, lambda staging: identifying.write(staging, result, common.figures, made_by))
     if not common.quiet:
-        terminal.print_report(reports.identify_report(results.summary(result)), folder)
+        terminal.print_result("identify", results.summary(result), loaded.plant.kind, folder)
     return 0 if result.is_identified else 1
 
 

@@ -11,11 +11,12 @@ from cyclopts import App, CycloptsError, Parameter
 from cyclopts.exceptions import UnusedCliTokensError
 
 import ptsmc_jax
-from tuning.cli import INTERRUPTED, campaign_commands, flight_commands, identify_command, searches, writing_commands
+from tuning.cli import INTERRUPTED, campaign_commands, identify_command, searches, writing_commands
 from tuning.cli.options import (
     USUAL,
     Against,
     Common,
+    ControllerFolder,
     Device,
     Figures,
     Force,
@@ -58,7 +59,7 @@ def simulate(
         int | None,
         whole_number("Simulate this dispersed trial; default: nominal parameters with the noise of trial 0."),
     ] = None,
-    controller: flight_commands.ControllerFolder = None,
+    controller: ControllerFolder = None,
     aem: Annotated[
         bool, Parameter(help="Write attitude.aem too, a CCSDS attitude ephemeris message.", negative="")
     ] = False,
@@ -68,7 +69,9 @@ def simulate(
 
     Exit status: 0 every requirement met, 1 not met or the run failed, 2 configuration error.
     """
-    loaded, folder = prepare(scenario, "simulate", out, trust=common.trust, force=common.force)
+    loaded, folder = prepare(
+        scenario, "simulate", out, trust=common.trust, force=common.force, in_c=controller is not None
+    )
     from ptsmc_jax.campaigns import runs, store
     from ptsmc_jax.scenario import study, timing
     from ptsmc_jax.simulation.computer import PYTHON_SOFTWARE
@@ -76,24 +79,23 @@ def simulate(
 
     if aem and loaded.motion != "spacecraft":
         raise UsageError("--aem is given, but the plant is no spacecraft and has no attitude")
-    loaded = loaded if controller is None else flight_commands.on_flight_clock(loaded)
     ready = study(loaded, drawn=trial is not None)
-    computer = None if controller is None else flight_commands.compile_controller(controller, ready)
+    computer = None
+    if controller is not None:
+        from ptsmc_jax.onboard.library import InTheLoop, Library
+
+        computer = InTheLoop(Library(controller), ready.parts, ready.dispersion)
+        if computer.parameter_differences:
+            print(f"ptsmc: {computer.parameter_differences}", file=sys.stderr)
     steps = timing.count_steps(ready.parts)
     if steps > LONG and not common.quiet:
         terminal.print_lines(f"simulating {steps} integration steps with their history")
     with store.lock_folder(folder, force=common.force):
         run = runs.simulate(ready, seed, trial, PYTHON_SOFTWARE if computer is None else computer.software)
-
-        def write(staging: Path) -> None:
-            single.write(staging, loaded, run, seed, trial, common.figures, computer, aem=aem)
-
-        store.write_folder(folder, write)
+        written = loaded, run, seed, trial, common.figures, computer
+        store.write_folder(folder, lambda staging: single.write(staging, *written, aem=aem))
     if not common.quiet:
-        from tuning.output import reports
-
-        summary = single.summary(run, loaded, computer)
-        terminal.print_report(reports.build("simulate", summary, loaded.plant.kind), folder)
+        terminal.print_result("simulate", single.summary(run, loaded, computer), loaded.plant.kind, folder)
     return 0 if run.met else 1
 
 
@@ -118,9 +120,7 @@ def reproduce(*, out: Out = None, force: Force = False, quiet: Quiet = False, fi
             reproduced = reproduction.reproduce()
         store.write_folder(folder, lambda staging: reproduction.write(staging, reproduced, figures))
     if not quiet:
-        from tuning.output import reports
-
-        terminal.print_report(reports.paper_report(reproduction.summary(reproduced)), folder)
+        terminal.print_result("reproduce", reproduction.summary(reproduced), "spacecraft", folder)
     return 0 if reproduced.ok else 1
 
 
@@ -197,9 +197,7 @@ def margins(
         store.write_folder(folder, lambda staging: stability.write(staging, ready, course, common.figures))
     summary = stability.summary(ready, course)
     if not common.quiet:
-        from tuning.output import reports
-
-        terminal.print_report(reports.build("margins", summary, loaded.plant.kind), folder)
+        terminal.print_result("margins", summary, loaded.plant.kind, folder)
     return 0 if summary["stable"] else 1
 
 
@@ -327,7 +325,7 @@ def completion(
     return 0
 
 
-_MODULES = (writing_commands, campaign_commands, flight_commands, identify_command)
+_MODULES = (writing_commands, campaign_commands, identify_command)
 for _command in (one for module in _MODULES for one in module.COMMANDS):
     app.command(_command)
 
@@ -347,13 +345,11 @@ def main() -> None:
     except CycloptsError as error:
         refused = error.__cause__
         _fail(str(refused) if isinstance(refused, UsageError) else " ".join(str(error).split()))
-    except ValueError as error:
-        _fail(str(error) if _is_configuration_error(error) else _describe_custom_code_error(error))
     except OSError as error:
         name = error.filename2 or error.filename  # for a move, filename2 is its target; None if the disk is full
         _fail(f"{error.strerror or error}{'' if name is None else f': {name}'}")
     except (Exception, SystemExit) as error:  # custom code may exit
-        _fail(_describe_custom_code_error(error))
+        _fail(str(error) if _is_configuration_error(error) else _describe_custom_code_error(error))
     finally:
         if (programs := sys.modules.get("ptsmc_jax.programs")) is not None:
             programs.cancel_prepared()  # exiting waits for compilations
@@ -366,7 +362,7 @@ def _describe_unused_arguments(error: UnusedCliTokensError) -> str:
     return f"{command} does not take {unused}; its arguments: ptsmc {command} --help"
 
 
-def _is_configuration_error(error: ValueError) -> bool:
+def _is_configuration_error(error: BaseException) -> bool:
     from ptsmc_jax.campaigns.store import RefusedError
     from ptsmc_jax.scenario.errors import ScenarioError
 

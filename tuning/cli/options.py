@@ -42,6 +42,10 @@ Force = Annotated[bool, Parameter(negative="", help="Write into a folder that is
 Quiet = Annotated[bool, Parameter(negative="", help="Print nothing but errors.")]
 Figures = Annotated[bool, Parameter(negative="--no-figures", help="Draw figures.")]
 
+ControllerFolder = Annotated[
+    Path | None,
+    Parameter(help="Folder of `ptsmc export`: its C code is compiled and controls the simulation."),
+]
 Trust = Annotated[
     bool,
     Parameter(
@@ -154,6 +158,7 @@ def prepare(
     *,
     trust: bool,
     force: bool | None = None,
+    in_c: bool = False,
 ) -> "tuple[Scenario, Path]":
     """Check a scenario and the folder for its results, and configure JAX.
 
@@ -165,12 +170,13 @@ def prepare(
         bits: floating-point precision.
         trust: whether custom code may be run if the scenario is in a result folder.
         force: whether the folder may contain files; None: the command checks the folder later.
+        in_c: whether exported C code controls the simulations, which has the flight clock.
 
     Returns:
         The scenario, and the folder.
 
     Raises:
-        ScenarioError: the scenario is not valid.
+        ScenarioError: the scenario is not valid, or C code cannot control it.
         RefusedError: the folder must not be written to, or the scenario names code that must not be run.
         UsageError: the device is not available.
     """
@@ -196,4 +202,9 @@ def prepare(
         if not any(parsing.stated_tables(loaded).values()):
             print(f"ptsmc: {scenario} is empty; the paper's Case I is simulated", file=sys.stderr)
         custom_parts.allow_scenario(scenario, loaded, trust)
-    return reading.complete(loaded), folder
+    loaded = reading.complete(loaded)
+    if in_c:
+        from ptsmc_jax.onboard.folder import on_flight_clock
+
+        loaded = on_flight_clock(loaded)
+    return loaded, folder

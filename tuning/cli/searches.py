@@ -63,10 +63,7 @@ def run(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, qu
             summary = store.read_previous_summary(folder, tables, search.identity)
     assert summary is not None
     if not quiet:
-        from tuning.output import reports
-
-        report = reports.build(search.identity["command"], summary, loaded.plant.kind)
-        terminal.print_report(report, folder, earlier=was_finished)
+        terminal.print_result(search.identity["command"], summary, loaded.plant.kind, folder, earlier=was_finished)
     return STATUS[summary["status"]]
 
 

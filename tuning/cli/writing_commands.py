@@ -1,13 +1,14 @@
-"""Commands that do not simulate: write a page of results or a scenario file, and convert attitudes."""
+"""Commands that write files without a study: a page of results, a scenario, C code; and convert attitudes."""
 
 import json
+import shlex
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from tuning.cli.options import Quiet
+from tuning.cli.options import Force, Out, Quiet, Seed, Trust, prepare, whole_number
 from tuning.errors import UsageError
 from tuning.output import terminal
 
@@ -116,6 +117,62 @@ def _examples() -> Path:
     return installed if installed.is_dir() else package.parent / "scenarios"
 
 
+def export(
+    scenario: Annotated[
+        Path, Parameter(name="SCENARIO", help='Scenario file (TOML) with loop.mode = "sampled", such as a tuned.toml.')
+    ],
+    /,
+    *,
+    out: Out = None,
+    name: Annotated[
+        str | None,
+        Parameter(
+            help="Name of the C files, with _ for signs that C does not allow; default: the name of the scenario file."
+        ),
+    ] = None,
+    trials: Annotated[int, whole_number("Trials in vectors.csv, 1 to 100.", 1, 100)] = 3,
+    seed: Seed = 0,
+    reference_input: Annotated[
+        bool, Parameter(negative="", help="Make the reference an input instead of a function of time in the C.")
+    ] = False,
+    fmu: Annotated[bool, Parameter(negative="", help="Write the controller as an FMU, too.")] = False,
+    fmu_plant: Annotated[
+        bool, Parameter(negative="", help="Write the true plant with actuators and sensors as an FMU, too.")
+    ] = False,
+    fmi: Annotated[Literal[2, 3] | None, Parameter(help="Version of FMI; default: a file for each.")] = None,
+    no_binary: Annotated[
+        bool, Parameter(negative="", help="Write FMUs without a binary for this machine; sources only.")
+    ] = False,
+    trust: Trust = False,
+    force: Force = False,
+    quiet: Quiet = False,
+) -> int:
+    """Export attitude filter, observer, law and wheel allocation of a scenario as C99, with test vectors.
+
+    Exit status: 0 done, 2 configuration error, or a part that cannot be written in C.
+    """
+    if not (fmu or fmu_plant) and (fmi is not None or no_binary):
+        option = "--no-binary is given" if fmi is None else f"--fmi is {fmi}"
+        raise UsageError(f"{option}, but must be absent without --fmu or --fmu-plant")
+    loaded, folder = prepare(scenario, "export", out, trust=trust, force=force)
+    from ptsmc_jax.campaigns import store
+    from ptsmc_jax.onboard import folder as controllers
+    from ptsmc_jax.onboard import templates
+
+    c_name = controllers.identifier(name or scenario.stem)
+    controller = controllers.Controller(loaded, c_name, scenario.name, reference_input)
+    fmus = controllers.Fmus(fmu, fmu_plant, fmi, not no_binary)
+    with store.lock_folder(folder, force=force):
+        store.write_folder(folder, lambda staging: controllers.write(staging, controller, seed, trials, fmus))
+    if not quiet:
+        counts = templates.count_operations(controller.code.counts)
+        costs = ", ".join(f"{count} {operation}" for operation, count in counts.items() if count)
+        check = f"make -C {shlex.quote(str(folder))} check"
+        outputs = ", ".join(["controller", *fmus.files])
+        terminal.print_lines(f"a step takes at most {costs}", f"{outputs} in {folder}; {check}")
+    return 0
+
+
 # the first number may be negative
 _Numbers = Annotated[str | None, Parameter(help="Numbers, separated by commas or spaces.", allow_leading_hyphen=True)]
 _Rows = Annotated[str | None, Parameter(help="Nine numbers, row by row.", allow_leading_hyphen=True)]
@@ -147,4 +204,4 @@ def convert_attitude(
     return 0
 
 
-COMMANDS = (report, new, schema, examples, convert_attitude)
+COMMANDS = (report, new, schema, examples, export, convert_attitude)

@@ -1,23 +1,29 @@
 """Prints reports, tables and lines on the terminal."""
 
 import contextlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from tuning.output.report import Report, Table
+from tuning.output.report import Table
 
 WIDE = 1000  # assumed number of columns of a file or a pipe
 UNBROKEN_WIDTH = 24  # largest number of columns of a cell that is never broken
 
 
-def print_report(report: Report, folder: Path | str, *, earlier: bool = False) -> None:
-    """Print a report without its charts and pictures.
+def print_result(command: str, summary: Mapping[str, Any], plant: str, folder: Path, *, earlier: bool = False) -> None:
+    """Print the report of a result without its charts and pictures.
 
     Args:
-        report: report of a result.
+        command: name of the command.
+        summary: the content of `summary.json`.
+        plant: kind of the plant.
         folder: folder of the result.
         earlier: whether an earlier run wrote the result.
     """
+    from tuning.output import reports
+
+    report = reports.build(command, summary, plant)
     print_lines(report.headline, *report.lines)
     for title, content in report.printed():
         if title:
