@@ -1,7 +1,7 @@
 """Campaigns as matplotlib figures: bands of the error, distributions, points by status."""
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -116,19 +116,9 @@ def distributions(metrics: Mapping[str, Column]) -> Figure:
             logarithmic(axes, "x")
         if column.limit is not None:
             axes.axvline(column.limit, color=STYLES[1][0], ls="--", label=column.within())
-            axes.legend(fontsize=9, loc=_legend_place(axes, column.limit, ordered[:known]))
+            axes.legend(fontsize=9)
         axes.set(xlabel=column.label(name), ylabel="fraction of the trials")
     return figure
-
-
-def _legend_place(axes: Axes, limit: float, ordered: np.ndarray) -> str:
-    """Return a place for the legend that covers neither the rising curve nor the line of the limit."""
-    axes.autoscale_view()  # matplotlib would do it when it draws
-    transform = axes.transData + axes.transAxes.inverted()
-    limit_position, *ends = (transform.transform((x, 0.5))[0] for x in (limit, *ordered[:1], *ordered[-1:]))
-    if limit_position > 0.5:
-        return "upper left" if not ends or ends[1] > 0.5 else "center"
-    return "lower right" if not ends or ends[0] < 0.5 else "center"
 
 
 def torque_by_angle(
@@ -196,13 +186,5 @@ def _scatter_by_outcome(
         if np.any(has_outcome):
             label = f"{name.replace('_', ' ')}: {totals[name]}"
             width = 1.2 if marker in ("x", "+") else 0.0  # line markers are invisible without a width
-            axes.scatter(
-                x[has_outcome],
-                y[has_outcome],
-                s=size,
-                c=colour,
-                marker=marker,
-                alpha=0.6,
-                label=label,
-                linewidths=width,
-            )
+            style: Any = {"s": size, "c": colour, "marker": marker, "alpha": 0.6, "linewidths": width}
+            axes.scatter(x[has_outcome], y[has_outcome], label=label, **style)

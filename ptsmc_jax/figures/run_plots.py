@@ -32,8 +32,8 @@ def run_figures(parts: Parts, log: Log, limit: float | None, lower_bound: LowerB
     if np.any(log.d_hat):
         figures["disturbance"] = disturbance(parts, log)
     if log.wheels is not None:
-        figures["wheels"] = wheels(parts, log)
-        figures["wheel_torque"] = wheel_torque(parts, log)
+        figures["wheels"] = wheels(parts, log, 0, "Reaction wheels", "momentum", "N m s")
+        figures["wheel_torque"] = wheels(parts, log, 1, "Torque of the reaction wheels", "torque", "N m")
     return {**{chart.name: state(parts, log, chart) for chart in parts.plant.charts}, **figures}
 
 
@@ -102,17 +102,7 @@ def torque(parts: Parts, log: Log, limit: float | None = None, title: str | None
     return figure
 
 
-def wheels(parts: Parts, log: Log) -> Figure:
-    """Plot the momentum of the reaction wheels over time, and its limit."""
-    return _plot_wheels(parts, log, 0, "Reaction wheels", "momentum", "N m s")
-
-
-def wheel_torque(parts: Parts, log: Log) -> Figure:
-    """Plot the torque of the reaction wheels over time, and its limit."""
-    return _plot_wheels(parts, log, 1, "Torque of the reaction wheels", "torque", "N m")
-
-
-def _plot_wheels(parts: Parts, log: Log, index: int, title: str, quantity: str, unit: str) -> Figure:
+def wheels(parts: Parts, log: Log, index: int, title: str, quantity: str, unit: str) -> Figure:
     """Plot a quantity of each wheel over time, `log.wheels[index]`, with its limit, a field of `Wheels`."""
     assert log.wheels is not None
     figure, axes = new_figure(title, f"{quantity} [{unit}]")
