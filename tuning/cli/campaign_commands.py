@@ -143,17 +143,19 @@ def montecarlo(
         raise UsageError("--until-confident needs [requirements] on metrics in the scenario")
     from tuning.studies import campaign_folder
 
-    folder = campaign_folder.Folder(
-        path, loaded, seed, 10_000 if trials is None else trials, metrics, bits, controller=controller
-    )
+    table = None
     if runs is not None:
         from ptsmc_jax.campaigns import run_tables
 
         table = run_tables.read(runs)
-        folder = replace(folder, trials=table.height, table_name=runs.name, table=table)
+        trials = table.height
     if out is None:
         names = [path.name, *([controller.resolve().name] if controller else ()), *([runs.stem] if runs else ())]
-        folder = replace(folder, path=path.with_name("-".join(names)))
+        path = path.with_name("-".join(names))
+    folder = campaign_folder.Folder(
+        path, loaded, seed, 10_000 if trials is None else trials, metrics, bits,
+        table_name=None if runs is None else runs.name, table=table, controller=controller,
+    )  # fmt: skip
     if scenario is not None:
         searches.warn_about_seed(scenario, seed)
     if has_stop_width:
@@ -164,38 +166,30 @@ def montecarlo(
     if folder.parameter_differences:
         print(f"ptsmc: {folder.parameter_differences}", file=sys.stderr)
 
-    shared = this_shard != (1, 1) and not dry_run
     with (
         resumable(common.force),
-        store.lock_folder(folder.path, shared=shared),
+        store.lock_folder(folder.path, shared=this_shard != (1, 1)),
         _connect_cluster(cluster, tls) as workers,
     ):
         campaign_folder.begin(folder, common.force)
         with CampaignProgress(common.quiet) as report:
             if dry_run:
                 campaign_folder.write_run_table(folder, report)
-                simulated = folder
             else:
-                simulated = _simulate_shard(folder, this_shard, report, workers, until_confident)
+                folder = _simulate_shard(folder, this_shard, report, workers, until_confident)
         if not is_partial:
-            return _summarise(simulated, common.quiet, common.figures)
-    if not common.quiet:
-        _print_shard(simulated, this_shard, dry_run=dry_run)
-    return 0
-
-
-def _print_shard(folder: "Folder", this_shard: tuple[int, int], *, dry_run: bool) -> None:
-    """Print that a shard of a campaign, or its run table, is done."""
-    if dry_run:
+            return _summarise(folder, common.quiet, common.figures)
+    if dry_run and not common.quiet:
         terminal.print_lines(
             f"run table of {folder.trials} trials in {folder.dry_run_rows.folder}; nothing was simulated"
         )
-        return
-    simulated = sum(part.count for part in folder.rows.parts()[0])
-    terminal.print_lines(
-        f"shard {this_shard[0]}/{this_shard[1]} done: {simulated} of {folder.trials} trials are in {folder.path}",
-        "when all are there, in this folder or gathered into one: ptsmc summarize DIR",
-    )
+    elif not common.quiet:
+        simulated = sum(part.count for part in folder.rows.parts()[0])
+        terminal.print_lines(
+            f"shard {shard} done: {simulated} of {folder.trials} trials are in {folder.path}",
+            "when all are there, in this folder or gathered into one: ptsmc summarize DIR",
+        )
+    return 0
 
 
 def _connect_cluster(cluster: str | None, tls: dict[str, str]) -> "contextlib.AbstractContextManager[Cluster | None]":
@@ -215,14 +209,12 @@ def _simulate_shard(
     width: float | None,
 ) -> "Folder":
     """Simulate a shard of a campaign; width: value of --until-confident, or None."""
-    from tuning.studies import campaign_folder, campaign_theory
+    from tuning.studies import campaign_folder, campaign_summary, campaign_theory
 
     campaign_theory.prepare(folder)
     if width is None:
         campaign_folder.simulate(folder, this_shard, report, workers)
     else:
-        from tuning.studies import campaign_summary  # imported during the simulation
-
         trial_count = campaign_summary.until_confident(
             folder, width, lambda first: campaign_folder.simulate(folder, this_shard, report, workers, first)
         )
