@@ -107,7 +107,7 @@ class _ScenarioFile:
         for name, table in layouts.TABLES[self.plant].items():
             if name == "tune":
                 yield from ("", *self.requirement_lines())
-            yield from ("", *(self.dispersion_lines() if name == "dispersion" else self.table_lines(name, table)))
+            yield from ("", *self.table_lines(name, table))
 
     def table_lines(self, name: str, table: type[Table] | layouts.Kinds) -> Iterator[str]:
         """Return the lines of a table, followed by the keys of its other kinds as comments."""
@@ -149,22 +149,12 @@ class _ScenarioFile:
         explained_before = Attitude.__struct_fields__ if name != "initial" else ()
         for key in keys.list_keys(struct, self.resolved.unit_of_d):
             is_off = stated is None or key.name not in stated
-            kinds = layouts.KINDS.get(f"{name}.{key.name}")
+            kinds = layouts.DISPERSIONS[key.name] if name == "dispersion" else layouts.KINDS.get(f"{name}.{key.name}")
             if kinds is not None:
                 yield from self.inline_lines(name, key, (stated or {}).get(key.name, {}), kinds)
             elif not (is_off and key.name in explained_before):
                 value = values[key.name] if key.name in values else self.example_value(name, kind, key)
                 yield from _key_lines(is_off, key.name, value, _describe_key(key))
-
-    def dispersion_lines(self) -> Iterator[str]:
-        """Return the lines of [dispersion], one for each kind of each dispersion; unused kinds are comments."""
-        struct, stated = layouts.TABLES[self.plant]["dispersion"], self.stated_tables.get("dispersion")
-        assert isinstance(struct, type)
-        yield from _comment_lines(keys.description(struct))
-        yield f"{'#' if stated is None else ''}[dispersion]"
-        for key in keys.list_keys(struct, self.resolved.unit_of_d):
-            chosen = (stated or {}).get(key.name, {})
-            yield from self.inline_lines("dispersion", key, chosen, layouts.DISPERSIONS[key.name])
 
     def inline_lines(self, name: str, key: keys.Key, chosen: Mapping[str, Any], kinds: layouts.Kinds) -> Iterator[str]:
         """Return a line for each kind of an inline table; all but the kind in the scenario are comments.

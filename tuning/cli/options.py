@@ -118,34 +118,30 @@ def how_to_resume(force: bool) -> str:
     return f"the same command{' without --force' if force else ''} resumes it"
 
 
-VALUES = {"torque": "--points", "t_f": "--times", "margins": "--limits"}  # option for the values of each quantity
+# option for the values of each quantity, their smallest number, and the allowed values
+VALUES = {
+    "torque": ("--points", 1, ""),
+    "t_f": ("--times", 2, "two times or more in s, all different, such as 20,30,45"),
+    "margins": ("--limits", 1, "limits in dB, greater than 0 and all different, such as 4,6,9"),
+}
 
 
 def parse_traded_values(against: str, points: int | None, times: str | None, limits: str | None) -> tuple[float, ...]:
-    """Return the times of --times [s] or the limits of --limits [dB], empty without them; --points is only checked.
+    """Return the times of --times [s] or the limits of --limits [dB] in ascending order; --points is only checked.
 
     Raises:
         UsageError: an option does not belong to this quantity, or its values are not allowed.
     """
-    for (kind, option), value in zip(VALUES.items(), (points, times, limits), strict=True):
+    numbers: tuple[float, ...] = ()
+    for (kind, (option, fewest, allowed)), value in zip(VALUES.items(), (points, times, limits), strict=True):
         if value is not None and against != kind:
             raise UsageError(f"{option} is {value}, but must be absent without --against {kind}")
-    if times is not None:
-        return _parse_numbers("--times", times, 2, "two times or more in s, all different, such as 20,30,45")
-    if limits is not None:
-        return _parse_numbers("--limits", limits, 1, "limits in dB, greater than 0 and all different, such as 4,6,9")
-    return ()
-
-
-def _parse_numbers(option: str, text: str, fewest: int, allowed: str) -> tuple[float, ...]:
-    """Parse at least `fewest` positive numbers that commas separate, and return them in ascending order."""
-    try:
-        numbers = tuple(sorted(float(part) for part in text.split(",")))
-    except ValueError:
-        numbers = ()
-    valid = all(0.0 < value < float("inf") for value in numbers)
-    if len(numbers) < fewest or len(set(numbers)) < len(numbers) or not valid:
-        raise UsageError(f"{option} is {text}, but must be {allowed}")
+        if isinstance(value, str):
+            with contextlib.suppress(ValueError):
+                numbers = tuple(sorted(float(part) for part in value.split(",")))
+            valid = all(0.0 < number < float("inf") for number in numbers)
+            if len(numbers) < fewest or len(set(numbers)) < len(numbers) or not valid:
+                raise UsageError(f"{option} is {value}, but must be {allowed}")
     return numbers
 
 

@@ -19,6 +19,7 @@ def build(front: Front) -> Report:
     else:
         headline, mood = count_line(front), "calm"
     blocks = [result_table(front), Text(list(remark_lines(front))), gain_table(front)]
+    main_results = {"torque": _torque_results, "margins": _margin_results, "t_f": _time_results}[front.against]
     lines = [*main_results(front), *([count_line(front)] if front.requirements else []), *warning_lines(front.warnings)]
     return Report(headline, mood, lines, [Section(KINDS[front.against].title, blocks)])
 
@@ -79,11 +80,6 @@ def relative_spread(point: Point) -> str:
         return "-"
     low, high = point.interval
     return f"{50 * (high - low) / point.rms:.1f} %"
-
-
-def main_results(front: Front) -> Iterator[str]:
-    """Return lines with the main results: errors of a few points of the front, with their torque, margins or time."""
-    yield from {"torque": _torque_results, "margins": _margin_results, "t_f": _time_results}[front.against](front)
 
 
 def remark_lines(front: Front) -> Iterator[str]:
