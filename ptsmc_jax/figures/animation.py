@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.animation import FuncAnimation
 from matplotlib.figure import Figure
 
-from ptsmc_jax.figures.style import RC, STYLES
+from ptsmc_jax.figures.style import STYLES, styled
 from ptsmc_jax.simulation.rollout import Log, Parts
 
 SIDES = (0.5, 0.35, 0.25)  # half edges of the drawn box, independent of the inertia
@@ -44,6 +44,7 @@ def body_edges_and_axes(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return rotate_to_inertial(q, _CORNERS)[_EDGES], np.stack([np.zeros_like(tips), tips], axis=1)
 
 
+@styled
 def animate_run(parts: Parts, log: Log, frames: int = 40) -> Animation:
     """Animate the body of a run with its axes; the axes of the reference are dashed.
 
@@ -65,7 +66,7 @@ def animate_run(parts: Parts, log: Log, frames: int = 40) -> Animation:
     t = np.asarray(log.t)
     samples = np.searchsorted(t, np.linspace(0.0, t[-1], frames) * (1.0 - 1e-12))
     q, q_f = np.asarray(log.x.q)[samples], np.broadcast_to(np.asarray(log.reference.q), (len(t), 4))[samples]
-    with matplotlib.rc_context({**RC, "animation.embed_limit": 1e4}):  # MB; beyond it frames would be dropped
+    with matplotlib.rc_context({"animation.embed_limit": 1e4}):  # MB; beyond it frames would be dropped
         figure = Figure(figsize=(4.6, 4.6), dpi=70)
         axes = figure.add_subplot(projection="3d")
         box = [axes.plot([], [], [], color="0.45", lw=1.0)[0] for _ in _EDGES]
@@ -73,7 +74,7 @@ def animate_run(parts: Parts, log: Log, frames: int = 40) -> Animation:
         reference_axes = [axes.plot([], [], [], color=STYLES[k][0], lw=1.4, ls="--")[0] for k in range(3)]
         axes.set(xlim=(-1, 1), ylim=(-1, 1), zlim=(-1, 1), xticks=[], yticks=[], zticks=[])
         axes.set_box_aspect((1, 1, 1))
-        title = axes.set_title("")
+        title = axes.set_title("", loc="center")
 
         def draw(k: int) -> list:
             edges, axes_of_body = body_edges_and_axes(q[k])

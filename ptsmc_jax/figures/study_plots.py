@@ -302,7 +302,7 @@ def costs(
             axes.axhline(limit, **LIMIT)
         if sweep.ticks is not None:
             axes.set_xticks(sweep.values, sweep.ticks)
-        axes.set_title(title, fontsize=10)
+        axes.set_title(title, fontsize=10, loc="center")
         axes.set_xlabel(sweep.label, fontsize=10)
     return figure
 
@@ -366,7 +366,8 @@ def accuracy_map(
         for (label, line), style in zip(limit_lines.items(), ("-", "--", ":"), strict=False):
             axes.plot(*line, color="white", lw=3.0, ls=style)
             axes.plot(*line, color="black", lw=1.4, ls=style, label=label)
-        axes.set(xlim=limits[0], ylim=limits[1], title=titles[name])
+        axes.set(xlim=limits[0], ylim=limits[1])
+        axes.set_title(titles[name], loc="center")
         axes.grid(visible=False)
     for axes in panels[len(drawn) :]:
         axes.remove()

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-import matplotlib
+import matplotlib.style
 import matplotlib.ticker
 import numpy as np
 from matplotlib.axes import Axes
@@ -19,16 +19,8 @@ from ptsmc_jax.simulation.catalogues import CATALOGUES
 # colours of Okabe and Ito, distinct for the colour-blind; line styles are distinct in grey
 STYLES = (("#0072B2", "-"), ("#D55E00", "--"), ("#009E73", "-."), ("#000000", ":"), ("#CC79A7", (0, (5, 1, 1, 1))))
 TIME = "time [s]"
-RC: Any = {
-    "font.size": 11,
-    "axes.grid": True,
-    "grid.alpha": 0.3,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "lines.linewidth": 1.6,
-    "legend.frameon": False,
-}
-styled = matplotlib.rc_context(RC)  # decorator of functions that draw in this style
+# decorator of functions that draw in the style of ptsmc.mplstyle, which notebooks use too
+styled = matplotlib.style.context("ptsmc_jax.figures.ptsmc")
 LIMIT: Any = {"color": "0.3", "lw": 1.0, "ls": (0, (6, 3))}  # style of the line of a limit
 LOWER_BOUND: Any = {"color": "0.3", "lw": 1.0, "ls": ":"}  # style of the line of a lower bound
 WIDE_RATIO = 1e4  # ratio of an axis's ends above which numbers between powers of ten would overlap
