@@ -48,7 +48,7 @@ def warn_about_seed(scenario: Path, seed: int) -> None:
 def run(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, quiet: bool) -> int:
     """Show a finished search, resume an interrupted one, or begin a new one. Returns the exit status."""
     from ptsmc_jax.campaigns import store
-    from ptsmc_jax.scenario import parsing
+    from ptsmc_jax.scenario import parsing, study
 
     tables = parsing.dump(loaded)
     summary = None if force else store.read_previous_summary(folder, tables, search.identity)
@@ -59,33 +59,24 @@ def run(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, qu
             print(f"ptsmc: {folder} holds {difference}; --force runs it again", file=sys.stderr)
     else:
         with store.lock_folder(folder):
-            _search_and_write(search, loaded, folder, force=force, quiet=quiet)
-            summary = store.read_previous_summary(folder, tables, search.identity)
+            is_resumed = not force and store.has_unfinished_run(folder, tables, search.identity)
+            if not is_resumed:
+                store.check_folder(folder, force)
+            study(loaded)  # raises configuration errors before the search
+            search.check()
+            from tuning.search.journal import Journal
+
+            journal = Journal(store.begin_run(folder, tables, search.identity, fresh=not is_resumed))
+            with resumable(force):
+                with Progress(quiet, search.objective, loaded.plant.kind) as report:
+                    outcome = search.work(report, journal)
+                store.write_folder(folder, lambda staging: search.write(staging, outcome))
+            if outcome.status != "interrupted":
+                store.end_run(folder)
+            else:
+                print(f"ptsmc: interrupted; {how_to_resume(force)}", file=sys.stderr)
+        summary = store.read_previous_summary(folder, tables, search.identity)
     assert summary is not None
     if not quiet:
         terminal.print_result(search.identity["command"], summary, loaded.plant.kind, folder, earlier=was_finished)
     return STATUS[summary["status"]]
-
-
-def _search_and_write(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, quiet: bool) -> None:
-    """Begin or resume a search in a folder that this process has locked, and write its result."""
-    from ptsmc_jax.campaigns import store
-    from ptsmc_jax.scenario import parsing, study
-
-    tables = parsing.dump(loaded)
-    is_resumed = not force and store.has_unfinished_run(folder, tables, search.identity)
-    if not is_resumed:
-        store.check_folder(folder, force)
-    study(loaded)  # raises configuration errors before the search
-    search.check()
-    from tuning.search.journal import Journal
-
-    journal = Journal(store.begin_run(folder, tables, search.identity, fresh=not is_resumed))
-    with resumable(force):
-        with Progress(quiet, search.objective, loaded.plant.kind) as report:
-            outcome = search.work(report, journal)
-        store.write_folder(folder, lambda staging: search.write(staging, outcome))
-    if outcome.status != "interrupted":
-        store.end_run(folder)
-    else:
-        print(f"ptsmc: interrupted; {how_to_resume(force)}", file=sys.stderr)
