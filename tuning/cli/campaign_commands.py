@@ -46,10 +46,7 @@ def montecarlo(
     scenario: ScenarioFile = None,
     /,
     *,
-    trials: Annotated[
-        int | None,
-        whole_number("Number of trials, 1 to 4294967296; default: 10000.", 1, MOST_TRIALS, group=(HELP, TRIALS)),
-    ] = None,
+    trials: Annotated[int | None, whole_number(1, MOST_TRIALS, group=(HELP, TRIALS))] = None,
     runs: Annotated[
         Path | None,
         Parameter(
@@ -70,39 +67,15 @@ def montecarlo(
             "width, between 0 and 1.",
         ),
     ] = None,
-    metrics: Annotated[
-        str | None, Parameter(help="FILE.py:NAME of a function that adds custom metrics to the rows.")
-    ] = None,
-    shard: Annotated[
-        str,
-        Parameter(
-            group=(HELP, PARTS, WHERE),
-            help="I/N: simulate the I-th of N shards only, for batch queues; shards may share a folder.",
-        ),
-    ] = "1/1",
-    cluster: Annotated[
-        str | None,
-        Parameter(
-            group=(HELP, WHERE),
-            help="Simulate on a Dask cluster: ADDRESS or scheduler file, or local:N for N processes on this machine.",
-        ),
-    ] = None,
-    tls_ca: Annotated[Path | None, Parameter(help="TLS: certificate authority's file.")] = None,
-    tls_cert: Annotated[Path | None, Parameter(help="TLS: this client's certificate.")] = None,
-    tls_key: Annotated[Path | None, Parameter(help="TLS: this client's private key.")] = None,
+    metrics: str | None = None,
+    shard: Annotated[str, Parameter(group=(HELP, PARTS, WHERE))] = "1/1",
+    cluster: Annotated[str | None, Parameter(group=(HELP, WHERE))] = None,
+    tls_ca: Path | None = None,
+    tls_cert: Path | None = None,
+    tls_key: Path | None = None,
     device: Device = "cpu",
-    precision: Annotated[
-        Literal["64", "32"],
-        Parameter(help="Bits of every number; docs/python.md lists the limits of 32 bits."),
-    ] = "64",
-    dry_run: Annotated[
-        bool,
-        Parameter(
-            group=(HELP, PARTS, WHERE),
-            negative="",
-            help="Write the run table of the trials into DIR/runs, and simulate nothing.",
-        ),
-    ] = False,
+    precision: Literal["64", "32"] = "64",
+    dry_run: Annotated[bool, Parameter(group=(HELP, PARTS, WHERE))] = False,
     controller: ControllerFolder = None,
     common: Common = USUAL,
 ) -> int:
@@ -113,6 +86,17 @@ def montecarlo(
 
     Exit status: 0 every requirement met (without requirements: every trial converged at t_f), 1 not met, 2
     configuration error or a full disk, 130 interrupted.
+
+    Args:
+        trials: Number of trials, 1 to 4294967296; default: 10000.
+        metrics: FILE.py:NAME of a function that adds custom metrics to the rows.
+        shard: I/N: simulate the I-th of N shards only, for batch queues; shards may share a folder.
+        cluster: Simulate on a Dask cluster: ADDRESS or scheduler file, or local:N for N processes on this machine.
+        tls_ca: TLS: certificate authority's file.
+        tls_cert: TLS: this client's certificate.
+        tls_key: TLS: this client's private key.
+        precision: Bits of every number; docs/python.md lists the limits of 32 bits.
+        dry_run: Write the run table of the trials into DIR/runs, and simulate nothing.
     """
     this_shard = _parse_shard(shard)
     tls_files = {"tls_ca_file": tls_ca, "tls_client_cert": tls_cert, "tls_client_key": tls_key}
@@ -253,19 +237,17 @@ def worst(
             "`controller_ok`."
         ),
     ] = "window_error",
-    n: Annotated[int, whole_number("Number of trials, 1 to 10000.", 1, 10_000, name=("--n", "-n"))] = 5,
-    why: Annotated[
-        bool,
-        Parameter(
-            negative="",
-            help="Write why.csv: the inputs of these trials as percentiles of all trials, for every required metric.",
-        ),
-    ] = False,
+    n: Annotated[int, whole_number(1, 10_000, name=("--n", "-n"))] = 5,
+    why: bool = False,
     quiet: Quiet = False,
 ) -> int:
     """Print the worst trials of a campaign, failed trials first, and write them to worst.csv.
 
     Exit status: 0 done, 2 configuration error.
+
+    Args:
+        n: Number of trials, 1 to 10000.
+        why: Write why.csv: the inputs of these trials as percentiles of all trials, for every required metric.
     """
     _configure_jax(folder)
     from ptsmc_jax import scenario as scenarios
@@ -292,13 +274,17 @@ def replay(
     folder: CampaignFolder,
     /,
     *,
-    trial: Annotated[int, whole_number("Number of the trial.")],
-    out: Annotated[Path | None, Parameter(help="Folder for the results; default: DIR/replay/TRIAL.")] = None,
+    trial: Annotated[int, whole_number()],
+    out: Path | None = None,
     common: Common = USUAL,
 ) -> int:
     """Simulate one trial of a campaign again with its history, and compare it with its row.
 
     Exit status: 0 the run equals its row to 1e-12 (or has no row yet), 1 it does not, 2 configuration error.
+
+    Args:
+        trial: Number of the trial.
+        out: Folder for the results; default: DIR/replay/TRIAL.
     """
     _configure_jax(folder)
     from ptsmc_jax.campaigns import store

@@ -10,27 +10,17 @@ from tuning.cli.options import USUAL, Common, Out, prepare
 from tuning.errors import UsageError
 from tuning.output import progress, terminal
 
-Positive = Number(gt=0)
+Positive = Annotated[float | None, Parameter(validator=Number(gt=0))]
 
 
 def identify(
     scenario: Annotated[Path, Parameter(name="SCENARIO", help="Scenario file (TOML) with today's model.")],
     *logs: Annotated[Path, Parameter(name="LOG", help="Telemetry, .csv or .parquet; [telemetry] maps its columns.")],
-    validate: Annotated[
-        tuple[Path, ...], Parameter(negative="", help="Log that is predicted only, to check the model; several times.")
-    ] = (),
-    design: Annotated[
-        bool, Parameter(negative="", help="Propose a torque profile that determines the parameters; without logs.")
-    ] = False,
-    duration: Annotated[
-        float | None, Parameter(validator=Positive, help="Duration of the profile [s]; default: 300.")
-    ] = None,
-    rate: Annotated[
-        float | None, Parameter(validator=Positive, help="Largest rate in the profile [rad/s]; default: 0.05.")
-    ] = None,
-    torque: Annotated[
-        float | None, Parameter(validator=Positive, help="Largest torque [N m]; default: of the actuators.")
-    ] = None,
+    validate: tuple[Path, ...] = (),
+    design: bool = False,
+    duration: Positive = None,
+    rate: Positive = None,
+    torque: Positive = None,
     out: Out = None,
     common: Common = USUAL,
 ) -> int:
@@ -39,6 +29,13 @@ def identify(
     With --design it proposes the manoeuvre to record instead.
 
     Exit status: 0 the model explains the logs and every parameter is determined, 1 not, 2 configuration error.
+
+    Args:
+        validate: Log that is predicted only, to check the model; several times.
+        design: Propose a torque profile that determines the parameters; without logs.
+        duration: Duration of the profile [s]; default: 300.
+        rate: Largest rate in the profile [rad/s]; default: 0.05.
+        torque: Largest torque [N m]; default: of the actuators.
     """
     if design == bool(logs):
         raise UsageError(

@@ -14,22 +14,16 @@ import ptsmc_jax
 from tuning.cli import INTERRUPTED, campaign_commands, identify_command, searches, writing_commands
 from tuning.cli.options import (
     USUAL,
-    Against,
     Common,
     ControllerFolder,
     Device,
     Figures,
     Force,
-    FrontAgainst,
-    Laws,
     Out,
-    Points,
     Quiet,
     SampledFile,
     ScenarioFile,
     Seed,
-    SensitivityLimits,
-    Times,
     parse_traded_values,
     prepare,
     whole_number,
@@ -42,6 +36,7 @@ app = App(
     help="Prescribed-time sliding mode attitude control: simulate, tune, verify and export.",
     version=ptsmc_jax.__version__,
     help_format="plaintext",
+    default_parameter=Parameter(negative=""),
     suppress_keyboard_interrupt=False,
 )
 
@@ -55,19 +50,18 @@ def simulate(
     *,
     out: Out = None,
     seed: Seed = 0,
-    trial: Annotated[
-        int | None,
-        whole_number("Simulate this dispersed trial; default: nominal parameters with the noise of trial 0."),
-    ] = None,
+    trial: Annotated[int | None, whole_number()] = None,
     controller: ControllerFolder = None,
-    aem: Annotated[
-        bool, Parameter(help="Write attitude.aem too, a CCSDS attitude ephemeris message.", negative="")
-    ] = False,
+    aem: bool = False,
     common: Common = USUAL,
 ) -> int:
     """Simulate one run and write its history, metrics and figures.
 
     Exit status: 0 every requirement met, 1 not met or the run failed, 2 configuration error.
+
+    Args:
+        trial: Simulate this dispersed trial; default: nominal parameters with the noise of trial 0.
+        aem: Write attitude.aem too, a CCSDS attitude ephemeris message.
     """
     loaded, folder = prepare(
         scenario, "simulate", out, trust=common.trust, force=common.force, in_c=controller is not None
@@ -129,15 +123,9 @@ def map_(
     scenario: SampledFile = None,
     /,
     *,
-    x: Annotated[
-        str | None,
-        Parameter(help="KEY=LOW:HIGH:COUNT; default: loop.period from 0.4 to 10 times the scenario's period."),
-    ] = None,
-    y: Annotated[
-        str | None,
-        Parameter(help="KEY=LOW:HIGH:COUNT; default: delta from a period to t_f / 7, or the law's first gain."),
-    ] = None,
-    trials: Annotated[int, whole_number("Trials of each pair, 1 to 1000000.", 1, 1_000_000)] = 32,
+    x: str | None = None,
+    y: str | None = None,
+    trials: Annotated[int, whole_number(1, 1_000_000)] = 32,
     out: Out = None,
     seed: Seed = 0,
     device: Device = "cpu",
@@ -146,6 +134,11 @@ def map_(
     """Simulate the scenario over two of its keys: error and peak torque, with the stability limits of linear theory.
 
     Exit status: 0 done, 2 configuration error. A pair that is not allowed or fails is marked, not dropped.
+
+    Args:
+        x: KEY=LOW:HIGH:COUNT; default: loop.period from 0.4 to 10 times the scenario's period.
+        y: KEY=LOW:HIGH:COUNT; default: delta from a period to t_f / 7, or the law's first gain.
+        trials: Trials of each pair, 1 to 1000000.
     """
     loaded, folder = prepare(scenario, "map", out, device, trust=common.trust, force=common.force)
     from ptsmc_jax.campaigns import store
@@ -208,9 +201,7 @@ def tune(
     *,
     out: Out = None,
     seed: Seed = 0,
-    global_check: Annotated[
-        bool, Parameter(negative="", help="Check the result by differential evolution, an independent global search.")
-    ] = False,
+    global_check: bool = False,
     device: Device = "cpu",
     common: Common = USUAL,
 ) -> int:
@@ -220,6 +211,9 @@ def tune(
     resumes the search.
 
     Exit status: 0 every requirement met on the held-out trials, 1 not met, 2 configuration error, 130 interrupted.
+
+    Args:
+        global_check: Check the result by differential evolution, an independent global search.
     """
     loaded, folder = prepare(scenario, "tune", out, device, trust=common.trust)
     from ptsmc_jax.scenario.tables import objective_name
@@ -241,10 +235,16 @@ def pareto(
     scenario: ScenarioFile = None,
     /,
     *,
-    against: FrontAgainst = "torque",
-    points: Points = None,
-    limits: SensitivityLimits = None,
-    times: Times = None,
+    against: Literal["torque", "margins", "t_f"] = "torque",
+    points: Annotated[int | None, whole_number(3, 100)] = None,
+    limits: Annotated[
+        str | None,
+        Parameter(
+            help="Limits on the peak sensitivity max |S| to tune for, with --against margins [dB], such as 4,6. "
+            "Default: 3 to 12. The gains without a limit are found, too."
+        ),
+    ] = None,
+    times: str | None = None,
     out: Out = None,
     seed: Seed = 0,
     device: Device = "cpu",
@@ -255,6 +255,11 @@ def pareto(
     After Ctrl-C or a kill, the same command resumes the search.
 
     Exit status: 0 a point of the front meets every requirement, 1 none does, 2 configuration error, 130 interrupted.
+
+    Args:
+        against: Quantity that the accuracy is traded against.
+        points: Number of torque limits, each with its own tuned gains, 3 to 100; default: 20.
+        times: Prescribed times to tune for, with --against t_f [s], such as 20,30. Default: t_f / 2 to 2 t_f.
     """
     values = parse_traded_values(against, points, times, limits)
     loaded, folder = prepare(scenario, "pareto", out, device, trust=common.trust)
@@ -279,8 +284,14 @@ def compare(
     *,
     out: Out = None,
     seed: Seed = 0,
-    against: Against = None,
-    law: Laws = (),
+    against: Annotated[
+        tuple[str, ...] | None,
+        Parameter(
+            help="Law to compare with: pd, terminal, fixed_time, time_base_pd, time_base_sliding, scaling, "
+            "predefined_time, super_twisting; repeat the option for several. Default: all of them.",
+        ),
+    ] = None,
+    law: Annotated[tuple[str, ...], Parameter(show_default=False)] = (),
     device: Device = "cpu",
     common: Common = USUAL,
 ) -> int:
@@ -290,6 +301,9 @@ def compare(
 
     Exit status: 0 the tuned law of the paper meets every requirement, whatever the other laws do, 1 it does not, 2
     configuration error, 130 interrupted.
+
+    Args:
+        law: Custom law, FILE.py:NAME, to include in the comparison; repeat the option for several.
     """
     loaded, folder = prepare(scenario, "compare", out, device, trust=common.trust)
     from ptsmc_jax.scenario.tables import objective_name
@@ -314,12 +328,15 @@ def compare(
 
 @app.command
 def completion(
-    shell: Annotated[Literal["bash", "zsh", "fish", "powershell"], Parameter(name="SHELL", help="Name of the shell.")],
+    shell: Annotated[Literal["bash", "zsh", "fish", "powershell"], Parameter(name="SHELL")],
     /,
 ) -> int:
     """Print the script that completes commands and options in a shell: source <(ptsmc completion bash).
 
     Exit status: 0 done, 2 configuration error.
+
+    Args:
+        shell: Name of the shell.
     """
     terminal.print_lines(app.generate_completion(shell=shell))
     return 0

@@ -23,9 +23,9 @@ def _parse_integer(_: object, tokens: Sequence[Token]) -> int:
     return int(text)
 
 
-def whole_number(text: str, minimum: int = 0, maximum: int = 2**32 - 1, **others: Any) -> Parameter:
-    """Return an option that is a whole number in a range; text: its help; others: see `Parameter`."""
-    return Parameter(converter=_parse_integer, validator=Number(gte=minimum, lte=maximum), help=text, **others)
+def whole_number(minimum: int = 0, maximum: int = 2**32 - 1, **others: Any) -> Parameter:
+    """Return an option that is a whole number in a range; others: see `Parameter`."""
+    return Parameter(converter=_parse_integer, validator=Number(gte=minimum, lte=maximum), **others)
 
 
 ScenarioFile = Annotated[
@@ -37,9 +37,9 @@ SampledFile = Annotated[
 Out = Annotated[
     Path | None, Parameter(help="Folder for the results; default: out/COMMAND-NAME with the name of the scenario file.")
 ]
-Seed = Annotated[int, whole_number("Seed of all random numbers, 0 to 4294967295.")]
-Force = Annotated[bool, Parameter(negative="", help="Write into a folder that is not empty.")]
-Quiet = Annotated[bool, Parameter(negative="", help="Print nothing but errors.")]
+Seed = Annotated[int, whole_number(help="Seed of all random numbers, 0 to 4294967295.")]
+Force = Annotated[bool, Parameter(help="Write into a folder that is not empty.")]
+Quiet = Annotated[bool, Parameter(help="Print nothing but errors.")]
 Figures = Annotated[bool, Parameter(negative="--no-figures", help="Draw figures.")]
 
 ControllerFolder = Annotated[
@@ -49,7 +49,6 @@ ControllerFolder = Annotated[
 Trust = Annotated[
     bool,
     Parameter(
-        negative="",
         help="Run the Python files that results name. Read them first: they run with your permissions.",
     ),
 ]
@@ -67,41 +66,8 @@ class Common:
 
 
 USUAL = Common()
-Against = Annotated[
-    tuple[str, ...] | None,
-    Parameter(
-        negative="",
-        help="Law to compare with: pd, terminal, fixed_time, time_base_pd, time_base_sliding, scaling, "
-        "predefined_time, super_twisting; repeat the option for several. Default: all of them.",
-    ),
-]
-Laws = Annotated[
-    tuple[str, ...],
-    Parameter(
-        negative="",
-        show_default=False,
-        help="Custom law, FILE.py:NAME, to include in the comparison; repeat the option for several.",
-    ),
-]
-Device = Annotated[Literal["cpu", "gpu"], Parameter(help="Hardware that batches run on.")]
 
-FrontAgainst = Annotated[
-    Literal["torque", "margins", "t_f"], Parameter(help="Quantity that the accuracy is traded against.")
-]
-Points = Annotated[
-    int | None, whole_number("Number of torque limits, each with its own tuned gains, 3 to 100; default: 20.", 3, 100)
-]
-Times = Annotated[
-    str | None,
-    Parameter(help="Prescribed times to tune for, with --against t_f [s], such as 20,30. Default: t_f / 2 to 2 t_f."),
-]
-SensitivityLimits = Annotated[
-    str | None,
-    Parameter(
-        help="Limits on the peak sensitivity max |S| to tune for, with --against margins [dB], such as 4,6. Default: "
-        "3 to 12. The gains without a limit are found, too."
-    ),
-]
+Device = Annotated[Literal["cpu", "gpu"], Parameter(help="Hardware that batches run on.")]
 
 
 @contextlib.contextmanager

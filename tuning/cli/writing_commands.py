@@ -12,7 +12,7 @@ from tuning.cli.options import Force, Out, Quiet, Seed, Trust, prepare, whole_nu
 from tuning.errors import UsageError
 from tuning.output import terminal
 
-Overwrite = Annotated[bool, Parameter(negative="", help="Overwrite existing files.")]
+Overwrite = Annotated[bool, Parameter(help="Overwrite existing files.")]
 
 
 def report(
@@ -38,16 +38,18 @@ def new(
     file: Annotated[Path, Parameter(name="FILE", help="Scenario file to write.")] = Path("scenario.toml"),
     /,
     *,
-    plant: Annotated[
-        str | None, Parameter(help="Kind of the plant: spacecraft, chain or system; default: spacecraft.")
-    ] = None,
-    like: Annotated[Path | None, Parameter(help="Scenario to start from; default: the default values.")] = None,
+    plant: str | None = None,
+    like: Path | None = None,
     force: Overwrite = False,
     quiet: Quiet = False,
 ) -> int:
     """Write a scenario file with every key, its value, unit and meaning.
 
     Exit status: 0 done, 2 configuration error.
+
+    Args:
+        plant: Kind of the plant: spacecraft, chain or system; default: spacecraft.
+        like: Scenario to start from; default: the default values.
     """
     from ptsmc_jax.campaigns import store
     from ptsmc_jax.scenario import layouts, parsing
@@ -124,25 +126,14 @@ def export(
     /,
     *,
     out: Out = None,
-    name: Annotated[
-        str | None,
-        Parameter(
-            help="Name of the C files, with _ for signs that C does not allow; default: the name of the scenario file."
-        ),
-    ] = None,
-    trials: Annotated[int, whole_number("Trials in vectors.csv, 1 to 100.", 1, 100)] = 3,
+    name: str | None = None,
+    trials: Annotated[int, whole_number(1, 100)] = 3,
     seed: Seed = 0,
-    reference_input: Annotated[
-        bool, Parameter(negative="", help="Make the reference an input instead of a function of time in the C.")
-    ] = False,
-    fmu: Annotated[bool, Parameter(negative="", help="Write the controller as an FMU, too.")] = False,
-    fmu_plant: Annotated[
-        bool, Parameter(negative="", help="Write the true plant with actuators and sensors as an FMU, too.")
-    ] = False,
-    fmi: Annotated[Literal[2, 3] | None, Parameter(help="Version of FMI; default: a file for each.")] = None,
-    no_binary: Annotated[
-        bool, Parameter(negative="", help="Write FMUs without a binary for this machine; sources only.")
-    ] = False,
+    reference_input: bool = False,
+    fmu: bool = False,
+    fmu_plant: bool = False,
+    fmi: Literal[2, 3] | None = None,
+    no_binary: bool = False,
     trust: Trust = False,
     force: Force = False,
     quiet: Quiet = False,
@@ -150,6 +141,15 @@ def export(
     """Export attitude filter, observer, law and wheel allocation of a scenario as C99, with test vectors.
 
     Exit status: 0 done, 2 configuration error, or a part that cannot be written in C.
+
+    Args:
+        name: Name of the C files, with _ for signs that C does not allow; default: the name of the scenario file.
+        trials: Trials in vectors.csv, 1 to 100.
+        reference_input: Make the reference an input instead of a function of time in the C.
+        fmu: Write the controller as an FMU, too.
+        fmu_plant: Write the true plant with actuators and sensors as an FMU, too.
+        fmi: Version of FMI; default: a file for each.
+        no_binary: Write FMUs without a binary for this machine; sources only.
     """
     if not (fmu or fmu_plant) and (fmi is not None or no_binary):
         option = "--no-binary is given" if fmi is None else f"--fmi is {fmi}"
@@ -186,13 +186,14 @@ def convert_attitude(
     mrp: _Numbers = None,
     dcm_body_to_inertial: _Rows = None,
     euler_deg: _Numbers = None,
-    sequence: Annotated[
-        str | None, Parameter(help="Three axes in SciPy's notation, for euler_deg and for the output; default: ZYX.")
-    ] = None,
+    sequence: str | None = None,
 ) -> int:
     """Print one attitude, of the body relative to the inertial frame, in every form that a scenario takes.
 
     Exit status: 0 done, 2 configuration error.
+
+    Args:
+        sequence: Three axes in SciPy's notation, for euler_deg and for the output; default: ZYX.
     """
     from tuning.cli import convert
 
