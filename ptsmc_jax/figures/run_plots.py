@@ -44,8 +44,7 @@ def state(parts: Parts, log: Log, chart: Chart, title: str | None = None) -> Fig
     if chart.with_reference:
         axes.plot(log.t, getattr(log.reference, chart.column), color="0.6", lw=1.0, zorder=1)
         axes.plot([], [], color="0.6", lw=1.0, label="reference")
-    _mark_prescribed_time(axes, parts)
-    _add_legend(axes, ncols=2)
+    _mark_t_f_and_add_legend(axes, parts, ncols=2)
     return figure
 
 
@@ -69,8 +68,7 @@ def error(parts: Parts, log: Log, lower_bound: LowerBound | None = None) -> Figu
     t_f = float(parts.controller.t_f)
     axes.axvspan(t_f, t_f + float(parts.window), color="0.85", label="window of window_error")
     _cut_axis(axes)
-    _mark_prescribed_time(axes, parts)
-    _add_legend(axes)
+    _mark_t_f_and_add_legend(axes, parts)
     return figure
 
 
@@ -97,8 +95,7 @@ def torque(parts: Parts, log: Log, limit: float | None = None, title: str | None
         axes.plot(log.t[row], peak, "o", mfc="none", color="black", label=label)
     if limit is not None:
         _draw_limit(axes, limit, unit)
-    _mark_prescribed_time(axes, parts)
-    _add_legend(axes)
+    _mark_t_f_and_add_legend(axes, parts)
     return figure
 
 
@@ -110,8 +107,7 @@ def wheels(parts: Parts, log: Log, index: int, title: str, quantity: str, unit: 
     limit = getattr(parts.actuators.wheels, f"{quantity}_limit", None)
     if limit is not None:
         _draw_limit(axes, float(limit), f" {unit}")
-    _mark_prescribed_time(axes, parts)
-    _add_legend(axes, ncols=2)
+    _mark_t_f_and_add_legend(axes, parts, ncols=2)
     return figure
 
 
@@ -124,8 +120,7 @@ def sliding(parts: Parts, log: Log) -> Figure:
         axes.plot(before, envelopes.sliding_bound(parts, before), **BOUND_LINE)
     axes.set_yscale("log")
     _cut_axis(axes)
-    _mark_prescribed_time(axes, parts)
-    _add_legend(axes)
+    _mark_t_f_and_add_legend(axes, parts)
     return figure
 
 
@@ -178,8 +173,7 @@ def disturbance(parts: Parts, log: Log) -> Figure:
         axes.plot(
             log.t, true, color="black", lw=1.2, ls=STYLES[k % len(STYLES)][1], zorder=5, label=f"true $d_{{{k + 1}}}$"
         )
-    _mark_prescribed_time(axes, parts)
-    _add_legend(axes, ncols=2)
+    _mark_t_f_and_add_legend(axes, parts, ncols=2)
     return figure
 
 
@@ -209,12 +203,6 @@ def _cut_axis(axes: Axes) -> None:
     axes.set_ylim(bottom=SMALLEST if low < SMALLEST < high else low)
 
 
-def _add_legend(axes: Axes, ncols: int = 1) -> None:
-    """Add the legend where it covers the curves least; in a corner if they have too many points for the search."""
-    points = sum(np.size(line.get_xdata()) for line in axes.lines)
-    axes.legend(ncols=ncols, loc="best" if points < MANY_POINTS else "upper right")
-
-
 def _draw_limit(axes: Axes, limit: float, unit: str) -> None:
     """Draw lines at plus and minus a limit; only name it in the legend if it would flatten the curves."""
     largest = max((np.nanmax(np.abs(line.get_ydata()), initial=0.0) for line in axes.lines), default=0.0)
@@ -226,8 +214,8 @@ def _draw_limit(axes: Axes, limit: float, unit: str) -> None:
     axes.plot([], [], **LIMIT, label=f"limit {limit:g}{unit}")
 
 
-def _mark_prescribed_time(axes: Axes, parts: Parts) -> None:
-    """Draw a line at the prescribed time."""
+def _mark_t_f_and_add_legend(axes: Axes, parts: Parts, ncols: int = 1) -> None:
+    """Draw a line at the prescribed time, and add the legend where it covers the curves least."""
     t_f = float(parts.controller.t_f)
     axes.axvline(t_f, color="0.3", lw=0.9, ls=":")
     axes.annotate(
@@ -235,3 +223,5 @@ def _mark_prescribed_time(axes: Axes, parts: Parts) -> None:
         textcoords="offset points", ha="center", va="bottom", fontsize=9, color="0.3",
     )  # fmt: skip
     axes.margins(x=0.01)
+    points = sum(np.size(line.get_xdata()) for line in axes.lines)
+    axes.legend(ncols=ncols, loc="best" if points < MANY_POINTS else "upper right")

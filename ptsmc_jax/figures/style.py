@@ -26,12 +26,11 @@ LOWER_BOUND: Any = {"color": "0.3", "lw": 1.0, "ls": ":"}  # style of the line o
 WIDE_RATIO = 1e4  # ratio of an axis's ends above which numbers between powers of ten would overlap
 
 
-def save(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
-    """Write NAME.png for each figure into a folder, with a mark for `store.remove_summary`; return the paths."""
+def save(figures: Mapping[str, Figure], folder: Path) -> None:
+    """Write NAME.png for each figure into a folder, with a mark for `store.remove_summary`."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, figure in figures.items():
         figure.savefig(folder / f"{name}.png", metadata={"Creator": "ptsmc"})
-    return [folder / f"{name}.png" for name in figures]
 
 
 @styled
