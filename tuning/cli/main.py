@@ -328,7 +328,7 @@ def compare(
 
 @app.command
 def completion(
-    shell: Annotated[Literal["bash", "zsh", "fish", "powershell"], Parameter(name="SHELL")],
+    shell: Literal["bash", "zsh", "fish", "powershell"],
     /,
 ) -> int:
     """Print the script that completes commands and options in a shell: source <(ptsmc completion bash).

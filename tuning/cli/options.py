@@ -28,12 +28,8 @@ def whole_number(minimum: int = 0, maximum: int = 2**32 - 1, **others: Any) -> P
     return Parameter(converter=_parse_integer, validator=Number(gte=minimum, lte=maximum), **others)
 
 
-ScenarioFile = Annotated[
-    Path | None, Parameter(name="SCENARIO", help="Scenario file (TOML); default: the paper's Case I.")
-]
-SampledFile = Annotated[
-    Path | None, Parameter(name="SCENARIO", help='Scenario file (TOML) with loop.mode = "sampled".')
-]
+ScenarioFile = Annotated[Path | None, Parameter(help="Scenario file (TOML); default: the paper's Case I.")]
+SampledFile = Annotated[Path | None, Parameter(help='Scenario file (TOML) with loop.mode = "sampled".')]
 Out = Annotated[
     Path | None, Parameter(help="Folder for the results; default: out/COMMAND-NAME with the name of the scenario file.")
 ]

@@ -35,7 +35,7 @@ def report(
 
 
 def new(
-    file: Annotated[Path, Parameter(name="FILE", help="Scenario file to write.")] = Path("scenario.toml"),
+    file: Annotated[Path, Parameter(help="Scenario file to write.")] = Path("scenario.toml"),
     /,
     *,
     plant: str | None = None,
@@ -66,7 +66,7 @@ def new(
 
 
 def schema(
-    file: Annotated[Path, Parameter(name="FILE", help="JSON Schema to write.")] = Path("scenario.schema.json"),
+    file: Annotated[Path, Parameter(help="JSON Schema to write.")] = Path("scenario.schema.json"),
     /,
     *,
     force: Overwrite = False,
@@ -120,9 +120,7 @@ def _examples() -> Path:
 
 
 def export(
-    scenario: Annotated[
-        Path, Parameter(name="SCENARIO", help='Scenario file (TOML) with loop.mode = "sampled", such as a tuned.toml.')
-    ],
+    scenario: Annotated[Path, Parameter(help='Scenario file (TOML) with loop.mode = "sampled", such as a tuned.toml.')],
     /,
     *,
     out: Out = None,
