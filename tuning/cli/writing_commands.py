@@ -100,8 +100,6 @@ def examples(
     from ptsmc_jax.campaigns import store
 
     packaged = sorted(path for path in _examples().iterdir() if path.suffix in (".toml", ".py"))
-    if folder.exists() and not folder.is_dir():
-        raise store.RefusedError(f"the folder is {folder}, but that is a file; allowed is a new or an existing folder")
     folder.mkdir(parents=True, exist_ok=True)
     for path in packaged:
         store.check_file(folder / path.name, force)
