@@ -26,6 +26,7 @@ def compared(name: str, count: int) -> None:
     from ptsmc_jax.campaigns import store
     from ptsmc_jax.onboard import folder, vectors
     from ptsmc_jax.onboard.library import Library
+    from tests.onboard.compiled import step_many
     from tests.onboard.flights import FLIGHTS
 
     begin = time.perf_counter()
@@ -34,8 +35,8 @@ def compared(name: str, count: int) -> None:
         store.write_folder(Path(place) / "c", lambda making: folder.write_program(making, made))
         generated = time.perf_counter() - begin
         library, single = (Library(Path(place) / "c", real) for real in ("double", "float"))
-    dispersion = vectors.with_nominal_reference(made.ready.dispersion)
-    simulated = vectors.simulate_many(made.ready.parts, dispersion, jnp.uint32(0), jnp.arange(count, dtype=jnp.uint32))
+    trials, ready = jnp.arange(count, dtype=jnp.uint32), made.ready
+    simulated = vectors.simulate_many(ready.parts, ready.dispersion, jnp.uint32(0), trials)
     simulated = jax.tree.map(np.asarray, simulated)
     worst, worst_of_peak, used = 0.0, 0.0, 0
     given = np.empty((0, 0))
@@ -47,10 +48,10 @@ def compared(name: str, count: int) -> None:
         used += 1
         given, out, _ = vectors.rows(made.board, samples)
         state = vectors.first_state(made.board, samples)
-        expected = out[:, at : at + samples.command.shape[1]]
+        expected = out[:, at : at + samples.outputs["command"].shape[1]]
         found = np.empty_like(expected)
         for n, row in enumerate(given):
-            state, outputs, _ = library.step_many(state, row)
+            state, outputs, _ = step_many(library, state, row)
             found[n] = outputs[at : at + expected.shape[1]]
         off = np.linalg.norm(found - expected, axis=1)
         size = np.linalg.norm(expected, axis=1)
@@ -61,7 +62,7 @@ def compared(name: str, count: int) -> None:
     seconds = []
     for _ in range(7):
         begin = time.perf_counter()
-        library.step_many(*many)
+        step_many(library, *many)
         seconds.append((time.perf_counter() - begin) / 100_000)
     print(
         f"| {name} | {used} of {count} | {worst:.1e} | {worst_of_peak:.1e} | {1e6 * np.median(seconds):.2f} us "

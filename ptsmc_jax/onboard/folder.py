@@ -95,10 +95,10 @@ def simulate(controller: Controller, seed: int, trials: int) -> dict[int, vector
     Raises:
         ScenarioError: if no trial is usable, see `vectors.is_usable`.
     """
-    dispersion = vectors.with_nominal_reference(controller.ready.dispersion)
-    numbers = np.arange(trials, dtype=np.uint32)
-    simulated = vectors.simulate_many(controller.ready.parts, dispersion, jnp.uint32(seed), jnp.asarray(numbers))
-    samples_by_trial = {int(k): vectors.single_trial(simulated, int(k)) for k in numbers}
+    parts, dispersion = controller.ready.parts, controller.ready.dispersion
+    numbers = jnp.arange(trials, dtype=jnp.uint32)
+    simulated = vectors.simulate_many(parts, dispersion, jnp.uint32(seed), numbers)
+    samples_by_trial = {k: vectors.single_trial(simulated, k) for k in range(trials)}
     usable = {k: samples for k, samples in samples_by_trial.items() if vectors.is_usable(samples)}
     if not usable:
         raise ScenarioError(

@@ -88,8 +88,8 @@ class Library:
         with tempfile.TemporaryDirectory(prefix="ptsmc-") as build_folder:
             library = self._compile(Path(build_folder), real, options)
             try:
-                self._binary = ctypes.CDLL(str(library))
-                self._binary.ptsmc_set()
+                self.binary = ctypes.CDLL(str(library))
+                self.binary.ptsmc_set()
             except (OSError, AttributeError) as error:  # built for another processor or language, or without a function
                 reason = str(error).removeprefix(f"{library}: ")
                 raise ScenarioError(
@@ -98,12 +98,12 @@ class Library:
                     f"ptsmc_{self.name}.c and ptsmc_{self.name}_parameters.c"
                 ) from None
         # other sizes: the C belongs to another controller.json
-        if sizes != list((ctypes.c_long * 4).in_dll(self._binary, "ptsmc_sizes")):
+        if sizes != list((ctypes.c_long * 4).in_dll(self.binary, "ptsmc_sizes")):
             raise invalid
         # parameters (columns,) in the order of columns["params"]; the array shares its memory with the C
-        self.parameters = np.ctypeslib.as_array((ctypes.c_double * sizes[-1]).in_dll(self._binary, "ptsmc_given"))
+        self.parameters = np.ctypeslib.as_array((ctypes.c_double * sizes[-1]).in_dll(self.binary, "ptsmc_given"))
         self.target = f"ptsmc_{self.name}_{self.checksum}_{real}_{next(_loaded)}"  # name of the C function in XLA
-        jax.ffi.register_ffi_target(self.target, jax.ffi.pycapsule(self._binary.ptsmc_called), platform="cpu")
+        jax.ffi.register_ffi_target(self.target, jax.ffi.pycapsule(self.binary.ptsmc_called), platform="cpu")
 
     def _compile(self, folder: Path, real: str, options: tuple[str, ...]) -> Path:
         glue, library = folder / "glue.c", folder / "controller.so"
@@ -121,32 +121,8 @@ class Library:
     def initial_state(self) -> np.ndarray:
         """Return the state after `ptsmc_init`."""
         state = np.zeros(len(self.columns["state"]))
-        self._binary.ptsmc_first(_address(state))
+        self.binary.ptsmc_first(ctypes.c_void_p(state.ctypes.data))
         return state
-
-    def step_many(self, state: Any, inputs: Any, parameters: Any = np.nan) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Call `ptsmc_step` for each row.
-
-        Args:
-            state: states (.., columns).
-            inputs: inputs (.., columns).
-            parameters: parameters (.., columns) of the rows; NaN selects the value of `self.parameters`.
-
-        Returns:
-            New states (.., columns), outputs (.., columns) and statuses (..).
-        """
-        shape = np.shape(state)[:-1]
-        state, inputs = (
-            np.ascontiguousarray(v, dtype=float).reshape(*shape, len(self.columns[kind]))  # C reads doubles
-            for v, kind in ((state, "state"), (inputs, "in"))
-        )
-        parameter_shape = (*shape, self.parameters.size)
-        parameter_rows = np.ascontiguousarray(np.broadcast_to(np.asarray(parameters, float), parameter_shape))
-        after, out = np.empty_like(state), np.empty((*shape, len(self.columns["out"])))
-        status = np.empty(shape, dtype=np.int32)
-        count = ctypes.c_long(int(np.prod(shape, dtype=int)))
-        self._binary.ptsmc_many(count, *map(_address, (parameter_rows, state, inputs, after, out, status)))
-        return after, out, status
 
     def step_in_jax(self, state: jax.Array, inputs: jax.Array, parameters: jax.Array) -> tuple[jax.Array, ...]:
         """Call `ptsmc_step` for one row in a JAX program, or for many rows under vmap.
@@ -170,10 +146,6 @@ class Library:
         # a callback would deadlock: it waits for a thread that copies arrays, and each device may block one
         call: Any = jax.ffi.ffi_call(self.target, results, vmap_method="broadcast_all")
         return tuple(call(state, inputs, parameters))
-
-
-def _address(array: np.ndarray) -> ctypes.c_void_p:
-    return ctypes.c_void_p(array.ctypes.data)
 
 
 class InTheLoop:

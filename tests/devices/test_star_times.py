@@ -83,9 +83,9 @@ def test_filter_equals_the_independent_computation(run):
     np.testing.assert_allclose(simulated.inputs["attitude_age"][valid][:4], [0.0, 0.05, 0.0, 0.05], atol=1e-12)
     said = by_hand(parts, simulated)
     for k, (q, bias) in enumerate(said):
-        off = (q.inv() * Rotation.from_quat(simulated.after["attitude"][k])).magnitude()
+        off = (q.inv() * Rotation.from_quat(simulated.state["attitude"][k])).magnitude()
         assert off < 1e-12, k
-        np.testing.assert_allclose(simulated.after["bias"][k], bias, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(simulated.state["bias"][k], bias, rtol=0, atol=1e-12)
 
 
 def test_star_tracker_measures_the_attitude_at_its_own_sample_time(run):

@@ -85,11 +85,26 @@ def program(tables, place):
     return made
 
 
-def replayed(library, samples, state):
+def step_many(library, state, inputs, parameters=np.nan, function="ptsmc_many"):
+    """New states, outputs and statuses of a compiled controller for rows (.., columns); NaN selects its parameters."""
+    shape, columns = np.shape(state)[:-1], library.columns
+    state, inputs = (
+        np.ascontiguousarray(v, dtype=float).reshape(*shape, len(columns[kind]))  # C reads doubles
+        for v, kind in ((state, "state"), (inputs, "in"))
+    )
+    rows = np.broadcast_to(np.asarray(parameters, float), (*shape, library.parameters.size))
+    after, out, status = np.empty_like(state), np.empty((*shape, len(columns["out"]))), np.empty(shape, np.int32)
+    arrays = np.ascontiguousarray(rows), state, inputs, after, out, status
+    addresses = (ctypes.c_void_p(array.ctypes.data) for array in arrays)
+    getattr(library.binary, function)(ctypes.c_long(status.size), *addresses)
+    return after, out, status
+
+
+def replayed(library, samples, state, **options):
     """Statuses, outputs and states of a compiled controller for a sequence of samples."""
     statuses, outputs, states = [], [], []
     for row in samples:
-        state, out, status = library.step_many(state, row)
+        state, out, status = step_many(library, state, row, **options)
         statuses.append(int(status))
         outputs.append(out)
         states.append(state)

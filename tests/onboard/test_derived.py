@@ -16,7 +16,7 @@ from ptsmc_jax.onboard.library import Library, compiler
 from ptsmc_jax.onboard.readme import readme
 from scenarios.own_parts import LowPass
 from tests.helpers import short
-from tests.onboard.compiled import STRICT, needs_compiler, program
+from tests.onboard.compiled import STRICT, needs_compiler, program, step_many
 from tests.onboard.flights import FILTER, FLIGHTS, FULL, flight
 
 OTHER = np.diag([8.0, 13.0, 12.0]) + np.array([[0.0, 0.4, 0.3], [0.4, 0.0, -0.5], [0.3, -0.5, 0.0]])
@@ -75,17 +75,17 @@ def off(known, library):
     ready = scenario.study(folder.on_flight_clock(known))
     computer, trials = build_board(ready.parts), jnp.arange(2, dtype=jnp.uint32)
     parts = replace(ready.parts, substeps=10)  # equal for all gains, to share one compiled program
-    simulated = vectors.simulate_many(parts, vectors.with_nominal_reference(ready.dispersion), jnp.uint32(0), trials)
+    simulated = vectors.simulate_many(parts, ready.dispersion, jnp.uint32(0), trials)
     simulated = jax.tree.map(np.asarray, simulated)
     at, worst = library.columns["out"].index("command[0]"), 0.0
     for k in range(len(trials)):
         samples = vectors.single_trial(simulated, k)
         assert vectors.is_usable(samples)
         given, out, _ = vectors.rows(computer, samples)
-        state, commands = vectors.first_state(computer, samples), slice(at, at + samples.command.shape[1])
+        state, commands = vectors.first_state(computer, samples), slice(at, at + samples.outputs["command"].shape[1])
         found = np.empty_like(out)
         for n, row in enumerate(given):
-            state, found[n], _ = library.step_many(state, row)
+            state, found[n], _ = step_many(library, state, row)
         apart = np.abs(found[:, commands] - out[:, commands])
         worst = max(worst, float(np.max(apart) / np.max(np.abs(out[:, commands]))))
     return worst

@@ -18,7 +18,7 @@ from ptsmc_jax.onboard import folder
 from ptsmc_jax.onboard.library import Library, compiler
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
-from tests.onboard.compiled import STRICT, needs_compiler, program
+from tests.onboard.compiled import STRICT, needs_compiler, program, step_many
 from tests.onboard.flights import FLIGHTS, FULL, MOVING, SIX, flight
 from tests.onboard.test_sensor_suite_export import TABLES
 from tests.tree import ROOT
@@ -139,7 +139,7 @@ def test_controller_has_the_outputs_of_the_exported_c(library, loop):
     inputs = controller.names("input")
     for k, (readings, commands) in enumerate(rows):
         given = [k * controller.period, *(readings[name] for name in inputs)]
-        state, out, status = library.step_many(state, np.array(given))
+        state, out, status = step_many(library, state, np.array(given))
         found = np.array([v for name, v in commands.items() if name != "status"])
         assert found.tobytes() == out.tobytes()
         assert status == commands["status"]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ptsmc_jax.onboard.library import Library
-from tests.onboard.compiled import needs_compiler, program
+from tests.onboard.compiled import needs_compiler, program, step_many
 from tests.onboard.flights import FLIGHTS
 
 pytestmark = [needs_compiler, pytest.mark.skipif(shutil.which("make") is None, reason="this machine has no make")]
@@ -30,7 +30,7 @@ def exported(tmp_path_factory):
     state = library.initial_state()
     for k in range(SAMPLES):
         row = np.array([0.1 * k, 0.1, 0.2, -0.1, np.sqrt(0.94), 1e-3, -2e-3, 1e-4 * k])
-        state, out, status = library.step_many(state, row)
+        state, out, status = step_many(library, state, row)
         rows.append((row, out, int(status)))
     assert any(np.any(out != rows[0][1]) for _, out, _ in rows)
     return place, rows

@@ -10,7 +10,7 @@ from ptsmc_jax.numerics import attitude
 from ptsmc_jax.onboard import folder, vectors
 from ptsmc_jax.onboard.library import Library
 from ptsmc_jax.simulation.computer import SAMPLE_STATUSES
-from tests.onboard.compiled import needs_compiler, program, replayed
+from tests.onboard.compiled import needs_compiler, program, replayed, step_many
 from tests.onboard.flights import LAW, LOOP, SPREAD
 
 
@@ -61,7 +61,7 @@ def columns(library, name):
 def test_exported_c_with_a_suite_replays_the_simulation(suite):
     """Each sample starts from the simulated state. Outputs and states agree to 1e-12 of their peak."""
     library, given, out, states = suite
-    after, outputs, statuses = library.step_many(states[:-1], given)
+    after, outputs, statuses = step_many(library, states[:-1], given)
     assert not statuses.any()
     for kind, found, wanted in (("out", outputs, out), ("state", after, states[1:])):
         names = [column.partition("[")[0] for column in library.columns[kind]]
