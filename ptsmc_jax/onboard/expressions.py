@@ -5,6 +5,7 @@ constants, and simplifies x + 0, 1 x and, for finite x, 0 x.
 """
 
 import math
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
@@ -13,7 +14,8 @@ import numpy as np
 # operations whose result is finite if their operands are
 FINITE_OPERATIONS = ("neg", "abs", "max", "min", "sign", "sin", "cos", "tanh", "atan", "select")
 REAL, BOOL = "real", "bool"  # kinds of numbers; the other kinds are C's integer types, such as "int32_t"
-TYPES = "bool, float32, float64, int8 to int64 or uint8 to uint32"  # dtypes that have a kind
+# kind of each dtype that C has
+KINDS = {"bool": BOOL, "float32": REAL, "float64": REAL, "int32": "int32_t", "int64": "int64_t", "uint32": "uint32_t"}
 
 
 class NoRuleError(ValueError):
@@ -93,41 +95,31 @@ class Region:
 
 # functions that evaluate an operation on constants, by operation
 EVALUATORS: dict[str, Callable] = {
-    "add": lambda a, b: a + b,
-    "sub": lambda a, b: a - b,
-    "mul": lambda a, b: a * b,
-    "neg": lambda a: -a,
-    "max": lambda a, b: a if a >= b or a != a else b,
-    "min": lambda a, b: a if a <= b or a != a else b,
-    "abs": abs,
-    "lt": lambda a, b: a < b,
-    "le": lambda a, b: a <= b,
-    "gt": lambda a, b: a > b,
-    "ge": lambda a, b: a >= b,
-    "eq": lambda a, b: a == b,
-    "ne": lambda a, b: a != b,
-    "and": lambda a, b: a and b,
-    "or": lambda a, b: a or b,
-    "not": lambda a: not a,
+    **{name: getattr(operator, name) for name in "add sub mul neg abs lt le gt ge eq ne".split()},
+    **{name: getattr(np, name) for name in "floor ceil rint sign".split()},
+    **{"max": np.maximum, "min": np.minimum, "and": operator.and_, "or": operator.or_, "not": operator.not_},
     "sqrt": lambda a: math.sqrt(a) if a >= 0.0 else math.nan,
-    "floor": lambda a: float(np.floor(a)),
-    "ceil": lambda a: float(np.ceil(a)),
-    "rint": lambda a: float(np.rint(a)),
-    "sign": lambda a: a if a != a else (a > 0) - (a < 0),
 }
 
 
 def kind_of(dtype: Any) -> str:
-    """Return the kind of the numbers of a dtype. Raises KeyError if there is none, see `TYPES`."""
-    if not isinstance(dtype, type | np.dtype):  # an extended dtype of JAX, for random keys
-        raise KeyError(dtype)
-    dtype = np.dtype(dtype)
-    if dtype.kind == "b":
-        return BOOL
-    if dtype.kind == "f":
-        return REAL
-    return {"int32": "int32_t", "int64": "int64_t", "uint32": "uint32_t", "int16": "int32_t", "int8": "int32_t",
-            "uint8": "int32_t", "uint16": "int32_t"}[dtype.name]  # fmt: skip
+    """Return the kind of the numbers of a dtype; empty if C does not have it, see `KINDS`."""
+    return KINDS.get(str(dtype), "")
+
+
+def name_nodes(array: np.ndarray, name: str, *, only_variables: bool = False) -> None:
+    """Name nodes of an array that have no name, except constants and places.
+
+    Args:
+        array: the nodes.
+        name: the name of the array.
+        only_variables: whether to name only variables of branches and loops.
+    """
+    title = Title(name)
+    for index, node in np.ndenumerate(array):
+        is_allowed = node.op == "variable" if only_variables else node.op not in ("constant", "place")
+        if node.title is None and is_allowed:
+            node.title, node.indices = title, "".join(str(i + 1) for i in index)
 
 
 class Pool:

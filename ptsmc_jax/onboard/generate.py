@@ -1,7 +1,6 @@
 """The C functions and structs of a flight computer, generated from its stages. Read `generate` first."""
 
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,13 +11,17 @@ from ptsmc_jax.batching.components import object_array
 from ptsmc_jax.laws.base import AccelerationLaw, Law
 from ptsmc_jax.laws.kinematics import AttitudeKinematics, Kinematics
 from ptsmc_jax.observers.base import Observer
-from ptsmc_jax.onboard import origins, parameters, printing
+from ptsmc_jax.onboard import origins, printing
 from ptsmc_jax.onboard.board import SCALARS, Board, Stage
-from ptsmc_jax.onboard.expressions import Node, Pool, Title, kind_of
-from ptsmc_jax.onboard.fields import Field, struct_fields
+from ptsmc_jax.onboard.expressions import Node, Pool, kind_of, name_nodes
+from ptsmc_jax.onboard.fields import Field, Parameters, collect_parameters, struct_fields
 from ptsmc_jax.onboard.translate import Translator
 
 Struct = dict[str, list[Field]]  # the fields of each named tree
+# attribute of `Board` and `Code` with a struct, by the prefix of a name that a stage reads or writes
+STRUCTS = {"in": "inputs", "before": "state", "now": "state", "last": "outputs", "out": "outputs"}
+# text before the field in C
+C_PREFIX = {"in": "in->", "before": "before->", "now": "now->", "last": "before->last.", "out": "out->"}
 POINTERS = {"p": "const ptsmc_params *p", "d": "const ptsmc_derived *d", "in": "const ptsmc_in *in",
             "before": "const ptsmc_state *before", "now": "ptsmc_state *now", "out": "ptsmc_out *out"}  # fmt: skip
 # arguments that ptsmc_step passes to the functions of the stages
@@ -32,11 +35,12 @@ COMMON_BASES = (object, Law, AccelerationLaw, Kinematics, AttitudeKinematics, Ob
 class Code:
     """The generated C of a flight computer."""
 
-    parameters: list[Field]
     values: dict[str, np.ndarray]  # values of the parameters, by name
     inputs: list[Field]
     state: list[Field]
     outputs: list[Field]
+    columns: dict[str, list[str]]  # names of the elements, by struct: "in", "out", "state", "params"
+    parameters: list[Field] = field(default_factory=list)
     functions: list[str] = field(default_factory=list)  # text of the functions
     calls: dict[str, str] = field(default_factory=dict)  # text of the function calls, by stage
     stage_descriptions: dict[str, str] = field(default_factory=dict)  # description of each stage of a sample
@@ -50,33 +54,25 @@ class Code:
     derivation_counts: dict[str, int] = field(default_factory=dict)  # number of operations of the derivation
     variables: int = 0  # largest number of variables in a function
 
-    @property
-    def columns(self) -> dict[str, list[str]]:
-        """The names of the elements, by struct, see the function `struct_columns`."""
-        parameters = [element for member in self.parameters for element in member.elements()]
-        return {**struct_columns(self.inputs, self.state, self.outputs), "params": parameters}
-
 
 def generate(board: Board) -> Code:
     """Return the C of a flight computer. Raises NoRuleError if an operation has no counterpart in C."""
-    params, structs = parameters.collect_parameters(board), _fields_by_struct(board)
+    params, structs = collect_parameters(board), _fields_by_struct(board)
     params.used.update(board.always_exported)
-    inputs, state, outputs = map(_declared_fields, structs.values())
-    code = Code([], {}, inputs, state, outputs)
+    code = Code(params.values, *map(_declared_fields, structs.values()), column_names(board))
+    code.stage_descriptions = {stage.name: stage.description for stage in board.stages if stage.name != "begin"}
     for stage in board.stages:
         _add_stage_function(code, board, stage, structs, params)
     _add_derivation(code, params)
     code.parameters = params.used_fields("p")
-    code.values = {member.name: params.values[member.name] for member in code.parameters}
+    code.columns["params"] = [element for member in code.parameters for element in member.elements()]
     return code
 
 
-def _add_derivation(code: Code, params: parameters.Parameters) -> None:
+def _add_derivation(code: Code, params: Parameters) -> None:
     """Add the function that derives numbers from parameters."""
-    code.derived = params.used_fields("d")
-    sources_of = {member.name: params.sources_of[member.name] for member in code.derived}
+    code.derived, code.sources_of = params.used_fields("d"), params.sources_of
     code.underivable = {name: reason for name, reason in params.underivable.items() if name in params.used}
-    code.sources_of = sources_of | {name: params.sources_of[name] for name in code.underivable}
     if not code.derived:
         return
     printer = printing.Printer()
@@ -85,7 +81,7 @@ def _add_derivation(code: Code, params: parameters.Parameters) -> None:
             for element, node in zip(member.elements(), results[member.name].flat, strict=True)]  # fmt: skip
     body = printer.body(block, outputs)
     params.mark_used(printer)
-    inputs = {name for names in sources_of.values() for name in names}
+    inputs = {name for member in code.derived for name in params.sources_of[member.name]}
     code.derivation_inputs = [member for member in params.used_fields("p") if member.name in inputs]
     elements = [element for member in code.derivation_inputs for element in member.elements()]
     copy_lines = [f"    d->of_{element} = p->{element};" for element in elements]
@@ -96,12 +92,9 @@ def _add_derivation(code: Code, params: parameters.Parameters) -> None:
     code.variables = max(code.variables, printer.variables)
 
 
-def _shapes(board: Board) -> dict[str, dict[str, Any]]:
-    return {"in": board.inputs, "before": board.state, "out": board.outputs}
-
-
 def _fields_by_struct(board: Board) -> dict[str, Struct]:
-    return {name: struct_fields(trees, board.meanings) for name, trees in _shapes(board).items()}
+    """Return the fields of inputs, state and outputs, by the attribute of the board."""
+    return {name: struct_fields(getattr(board, name), board.meanings) for name in ("inputs", "state", "outputs")}
 
 
 def _declared_fields(struct: Struct) -> list[Field]:
@@ -109,53 +102,33 @@ def _declared_fields(struct: Struct) -> list[Field]:
     return [member for members in struct.values() for member in members if member.size]
 
 
-def struct_columns(inputs: Sequence[Field], state: Sequence[Field], outputs: Sequence[Field]) -> dict[str, list[str]]:
-    """Return the columns of inputs, outputs and state in vectors.csv, named as in C.
-
-    Args:
-        inputs: fields of the inputs.
-        state: fields of the state.
-        outputs: fields of the outputs.
-
-    Returns:
-        The columns by struct: "in", "out" and "state".
-    """
-
-    def element_names(members: Sequence[Field], prefix: str = "") -> list[str]:
-        return [prefix + element for member in members for element in member.elements()]
-
-    return {
-        "in": ["t", *element_names(inputs)],
-        "out": element_names(outputs),
-        "state": ["t", "started", "tracking", *element_names(state), *element_names(outputs, "last.")],
-    }
-
-
 def column_names(board: Board) -> dict[str, list[str]]:
-    """Return the columns of vectors.csv for a flight computer, without generating its C."""
-    return struct_columns(*map(_declared_fields, _fields_by_struct(board).values()))
+    """Return the columns of vectors.csv, named as in C, by struct: "in", "out" and "state"."""
+    inputs, state, outputs = (
+        [element for member in _declared_fields(struct) for element in member.elements()]
+        for struct in _fields_by_struct(board).values()
+    )
+    last_outputs = [f"last.{element}" for element in outputs]
+    return {"in": ["t", *inputs], "out": outputs, "state": ["t", "started", "tracking", *state, *last_outputs]}
 
 
-# struct, and text before the field in C, by the prefix of a name that a stage reads or writes
-STRUCT_OF_PREFIX = {"in": "in", "before": "before", "now": "before", "last": "out", "out": "out"}
-C_PREFIX = {"in": "in->", "before": "before->", "now": "now->", "last": "before->last.", "out": "out->"}
-
-
-def _add_stage_function(
-    code: Code, board: Board, stage: Stage, structs: dict[str, Struct], params: parameters.Parameters
-) -> None:
+def _add_stage_function(code: Code, board: Board, stage: Stage, structs: dict[str, Struct], params: Parameters) -> None:
     """Add the function of a stage to the code."""
 
     def fields_of(name: str) -> list[Field]:
         prefix, _, key = name.partition(".")
-        return structs[STRUCT_OF_PREFIX[prefix]][key]
+        return structs[STRUCTS[prefix]][key]
+
+    def shape_of(name: str) -> Any:
+        prefix, _, key = name.partition(".")
+        return SCALARS[name]() if name in SCALARS else getattr(board, STRUCTS[prefix])[key]
 
     def run_stage(parameter_leaves: list[Any], read_values: list[Any]) -> dict[str, Any]:
         """Return the values that the stage writes, by name, given the values of the names in `stage.reads`."""
         return stage.run(params.unflatten(parameter_leaves), dict(zip(stage.reads, read_values, strict=True)))
 
     pool, args = Pool(), list[np.ndarray]()
-    shapes = [_shape_of(board, name) for name in stage.reads]
+    shapes = [shape_of(name) for name in stage.reads]
     jaxpr, written = jax.make_jaxpr(run_stage, return_shape=True)(params.leaves, shapes)
     for name, shape in zip(stage.reads, shapes, strict=True):
         if name in SCALARS:
@@ -172,7 +145,7 @@ def _add_stage_function(
         needed_arguments.add(prefix)
         for member in fields_of(name):
             result = next(results)
-            _name_variables(result, member.name)
+            name_nodes(result, member.name, only_variables=True)
             locations = (C_PREFIX[prefix] + element for element in member.elements())
             assignments += zip(locations, result.flat, strict=True)
     printer = printing.Printer(SCALAR_PARAMETERS)
@@ -183,25 +156,10 @@ def _add_stage_function(
     kind = "void" if return_value is None else "int"
     head = printing.wrap_statement(f"static {kind} {stage.name}({', '.join(arguments.values())})", "")
     code.functions.append("\n".join([*_stage_comment(stage), *head, "{", *body, "}"]))
-    if stage.name != "begin":
-        code.stage_descriptions[stage.name] = stage.description
     code.calls[stage.name] = f"{stage.name}({', '.join(CALL_ARGUMENTS.get(name, name) for name in arguments)})"
     code.counts.update(printer.counts)
     code.has_open_loop |= printer.has_open_loop
     code.variables = max(code.variables, printer.variables)
-
-
-def _shape_of(board: Board, name: str) -> Any:
-    prefix, _, key = name.partition(".")
-    return SCALARS[name]() if name in SCALARS else _shapes(board)[STRUCT_OF_PREFIX[prefix]][key]
-
-
-def _name_variables(result: np.ndarray, name: str) -> None:
-    """Name variables of branches and loops after the field that they are written to, if they have no name."""
-    title = Title(name)
-    for index, node in np.ndenumerate(result):
-        if node.op == "variable" and node.title is None:
-            node.title, node.indices = title, "".join(str(i + 1) for i in index)
 
 
 def _stage_comment(stage: Stage) -> list[str]:

@@ -23,8 +23,8 @@ from ptsmc_jax.devices.actuators import ActuatorState
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.onboard import sources
 from ptsmc_jax.onboard.board import board_parameters, build_board
+from ptsmc_jax.onboard.fields import COMPUTED, collect_parameters, name_parameters
 from ptsmc_jax.onboard.generate import column_names
-from ptsmc_jax.onboard.parameters import COMPUTED, collect_parameters, name_parameters
 from ptsmc_jax.onboard.templates import fill_template, with_public_prefix
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation.assembly import Parts

@@ -5,11 +5,9 @@ from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
+from jax import lax
 
 from ptsmc_jax.onboard.expressions import BOOL, REAL, Node, Pool
-
-# functions of `numerics.elementary`, which XLA computes by arithmetic and C by these functions of math.h
-KNOWN_FUNCTIONS = {"log": "log", "arctan2": "atan2"}
 
 
 def power(pool: Pool, x: Node, exponent: int) -> Node:
@@ -46,23 +44,21 @@ def convert(pool: Pool, kind: str, x: Node) -> Node:
         return pool.constant(x.value, kind)
     if kind == BOOL:
         return pool.make("ne", x, pool.constant(0, x.kind), kind=BOOL)
-    if x.kind == BOOL:
-        return pool.make("select", x, pool.constant(1, kind), pool.constant(0, kind), kind=kind) if kind == REAL \
-            else pool.make("convert", x, kind=kind)  # fmt: skip
+    if x.kind == BOOL and kind == REAL:
+        return pool.make("select", x, pool.constant(1, kind), pool.constant(0, kind), kind=kind)
     return pool.make("convert", x, kind=kind)
 
 
-def _check_precision(dtype: Any, kind: str) -> str:
-    """Return `kind`, or raise KeyError if the dtype is a floating-point type with fewer digits than numbers in C."""
-    if kind == REAL and jnp.finfo(dtype).bits < jnp.finfo(jnp.result_type(float)).bits:
-        raise KeyError(dtype)
-    return kind
+def _convert_element_type(pool: Pool, params: Any, kind: str, x: Node) -> Node:
+    if kind == REAL and jnp.finfo(params["new_dtype"]).bits < jnp.finfo(jnp.result_type(float)).bits:
+        raise KeyError("convert_element_type")  # C does not round to fewer digits
+    return convert(pool, kind, x)
 
 
 def _reduce_precision(pool: Pool, params: Any, kind: str, x: Node) -> Node:
     real = jnp.finfo(jnp.result_type(float))
     if params["exponent_bits"] < real.nexp or params["mantissa_bits"] < real.nmant:
-        raise KeyError("reduce_precision")  # a rounding to fewer digits has no rule
+        raise KeyError("reduce_precision")
     return x
 
 
@@ -79,12 +75,6 @@ def _bool_operation(op: str) -> Callable:
     return rule
 
 
-def _xor(pool: Pool, params: Any, kind: str, a: Node, b: Node) -> Node:
-    if kind != BOOL:
-        raise KeyError("xor")
-    return pool.make("ne", a, b, kind=BOOL)
-
-
 def _select(pool: Pool, params: Any, kind: str, selector: Node, *cases: Node) -> Node:
     if selector.kind == BOOL:
         no, yes = cases
@@ -94,15 +84,6 @@ def _select(pool: Pool, params: Any, kind: str, selector: Node, *cases: Node) ->
         test = pool.make("le", selector, pool.constant(k, selector.kind), kind=BOOL)
         result = pool.make("select", test, cases[k], result, kind=kind)
     return result
-
-
-def _round(pool: Pool, params: Any, kind: str, x: Node) -> Node:
-    to_even = "EVEN" in str(params["rounding_method"]) or int(params["rounding_method"]) == 1
-    return pool.make("rint" if to_even else "round", x)
-
-
-def _integer_pow(pool: Pool, params: Any, kind: str, x: Node) -> Node:
-    return power(pool, x, params["y"])  # JAX allows negative exponents for real numbers only
 
 
 def _division_rule(op: str) -> Callable:
@@ -129,8 +110,12 @@ ELEMENTWISE: dict[str, Callable] = {
        "nextafter floor ceil".split()},
     **{f"{op}_to": _same_operation(op) for op in ("lt", "le", "eq")},
     "is_finite": lambda pool, params, kind, x: pool.make("isfinite", x, kind=BOOL),
-    "and": _bool_operation("and"), "or": _bool_operation("or"), "not": _bool_operation("not"), "xor": _xor,
-    "add_any": _same_operation("add"), "integer_pow": _integer_pow, "select_n": _select, "round": _round,
+    **{op: _bool_operation(op) for op in ("and", "or", "not")}, "xor": _bool_operation("ne"),
+    "add_any": _same_operation("add"), "select_n": _select,
+    "integer_pow": lambda pool, params, kind, x: power(pool, x, params["y"]),
+    "round": lambda pool, params, kind, x: pool.make(
+        "rint" if params["rounding_method"] == lax.RoundingMethod.TO_NEAREST_EVEN else "round", x
+    ),
     "pow": lambda pool, params, kind, x, y: pool.make("pow", x, convert(pool, REAL, y)),
     "square": lambda pool, params, kind, x: pool.make("mul", x, x, kind=kind),
     "log2": lambda pool, params, kind, x: pool.make(  # XLA scales the natural logarithm, too
@@ -147,7 +132,7 @@ ELEMENTWISE: dict[str, Callable] = {
     "logistic": lambda pool, params, kind, x: _reciprocal(
         pool, pool.make("add", pool.constant(1.0, REAL), pool.make("exp", pool.make("neg", x)))
     ),
-    "convert_element_type": lambda pool, params, kind, x: convert(pool, _check_precision(params["new_dtype"], kind), x),
+    "convert_element_type": _convert_element_type,
     **dict.fromkeys("stop_gradient copy copy_p optimization_barrier pvary".split(), lambda pool, params, kind, x: x),
     "reduce_precision": _reduce_precision,
 }  # fmt: skip
