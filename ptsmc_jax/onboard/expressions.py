@@ -11,6 +11,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from ptsmc_jax.scenario.errors import ScenarioError
+
 # operations whose result is finite if their operands are
 FINITE_OPERATIONS = ("neg", "abs", "max", "min", "sign", "sin", "cos", "tanh", "atan", "select")
 REAL, BOOL = "real", "bool"  # kinds of numbers; the other kinds are C's integer types, such as "int32_t"
@@ -18,7 +20,7 @@ REAL, BOOL = "real", "bool"  # kinds of numbers; the other kinds are C's integer
 KINDS = {"bool": BOOL, "float32": REAL, "float64": REAL, "int32": "int32_t", "int64": "int64_t", "uint32": "uint32_t"}
 
 
-class NoRuleError(ValueError):
+class NoRuleError(ScenarioError):
     """An operation or a type has no counterpart in C. The message names the operation and its line in the source."""
 
 

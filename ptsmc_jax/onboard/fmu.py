@@ -10,6 +10,7 @@ import re
 import sys
 import tempfile
 import zipfile
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,13 +41,6 @@ BASE_UNITS = {
 FILTER_STATE = ("attitude", "bias", "gyro", "past_attitude", "past_rate")
 
 
-class Unit(NamedTuple):
-    """A physical unit."""
-
-    name: str  # such as "N.m"
-    exponents: dict[str, int]  # exponent of each base unit
-
-
 class Variable(NamedTuple):
     """A variable of an FMU. Its value reference is its index in the list of all variables."""
 
@@ -57,10 +51,10 @@ class Variable(NamedTuple):
     meaning: str
 
     @property
-    def unit(self) -> Unit | None:
-        """The unit in brackets in `meaning`, or None if there is no or more than one unit."""
+    def unit(self) -> tuple[str, dict[str, int]]:
+        """The unit in brackets in `meaning`, see `parse_unit`; an empty name if there is no or more than one unit."""
         units = re.findall(r"\[([^\]]+)\]", self.meaning)
-        return parse_unit(units[0]) if len(units) == 1 and self.kind == "r" else None
+        return parse_unit(units[0]) if len(units) == 1 and self.kind == "r" else ("", {})
 
 
 class Model(NamedTuple):
@@ -80,19 +74,21 @@ class Model(NamedTuple):
         return float(self.code.values["period"])
 
 
-def parse_unit(text: str) -> Unit | None:
-    """Return the unit of a text such as "N m/s^2", or None if it is not a product of integer powers of known units."""
-    exponents, names = dict[str, int](), list[str]()
+def parse_unit(text: str) -> tuple[str, dict[str, int]]:
+    """Return name and exponents of the base units of a unit such as "N m/s^2", which has the name "N.m/s2".
+
+    The name is empty if the text is not a product of integer powers of known units.
+    """
+    exponents = Counter[str]()
     for k, part in enumerate(text.split("/")):
         for factor in part.split():
             match = re.fullmatch(r"([A-Za-z]+|1)(?:\^(\d+))?", factor)
             if match is None or match[1] not in BASE_UNITS:
-                return None
-            power = int(match[2] or 1)
+                return "", {}
             for base, exponent in BASE_UNITS[match[1]].items():
-                exponents[base] = exponents.get(base, 0) + (-1 if k else 1) * exponent * power
-        names.append(".".join(part.replace("^", "").split()))
-    return Unit("/".join(names), {base: power for base, power in exponents.items() if power})
+                exponents[base] += (-1 if k else 1) * exponent * int(match[2] or 1)
+    name = "/".join(".".join(part.split()) for part in text.replace("^", "").split("/"))
+    return name, {base: power for base, power in exponents.items() if power}
 
 
 def list_variables(model: Model) -> list[Variable]:
@@ -183,10 +179,9 @@ def model_description(model: Model, version: int, token: str, c_files: Sequence[
         c_files: names of the C files that are compiled.
     """
     listed = list_variables(model)
-    units_by_name = {unit.name: unit for unit in (variable.unit for variable in listed) if unit is not None}
+    units = dict(variable.unit for variable in listed if variable.unit[0])
     exponents = {
-        name: "".join(f' {base}="{power}"' for base, power in unit.exponents.items())
-        for name, unit in units_by_name.items()
+        name: "".join(f' {base}="{power}"' for base, power in exponents.items()) for name, exponents in units.items()
     }
     outputs = [k for k, variable in enumerate(listed) if variable.role == "o"]
     output_elements = '    <Output valueReference="{}"/>', '    <InitialUnknown valueReference="{}"/>'
@@ -220,7 +215,7 @@ def _variable_element(variable: Variable, reference: int, version: int) -> str:
     attributes = f'name="{variable.name}" valueReference="{reference}" causality="{causality}"'
     attributes += f' variability="{variability}"'
     attributes += f" description={quoteattr(variable.meaning)}" if variable.meaning else ""
-    values = "" if variable.unit is None else f' unit="{variable.unit.name}"'
+    values = f' unit="{variable.unit[0]}"' if variable.unit[0] else ""
     if variable.role != "o":
         values += f' start="{variable.start!r}"' if variable.kind == "r" else f' start="{int(variable.start)}"'
     if version == 3:

@@ -17,10 +17,8 @@ from ptsmc_jax.onboard import templates, vectors
 from ptsmc_jax.onboard.board import Board, build_board
 from ptsmc_jax.onboard.generate import Code, generate
 from ptsmc_jax.onboard.plant import plant_board
-from ptsmc_jax.onboard.readme import readme
 from ptsmc_jax.onboard.sources import LAYOUT
 from ptsmc_jax.onboard.templates import ExportInfo
-from ptsmc_jax.onboard.translate import NoRuleError
 from ptsmc_jax.scenario import custom, parsing
 from ptsmc_jax.scenario.assembly import Study
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
@@ -36,10 +34,7 @@ class Controller:
         self.ready: Study = scenarios.study(self.scenario)
         self.reference_input = reference_input  # whether the reference is an input
         self.board: Board = build_board(self.ready.parts, reference_input)
-        try:
-            self.code: Code = generate(self.board)
-        except NoRuleError as error:
-            raise ScenarioError(str(error)) from None
+        self.code: Code = generate(self.board)
         law, device = self.ready.parts.controller, self.ready.parts.actuators
         self.info = ExportInfo(
             name, source, checksum(self.scenario), type(law).__qualname__, self.board.parameters["filter"] is not None,
@@ -113,12 +108,7 @@ def vector_table(
 ) -> tuple[list[str], list[list[Any]]]:
     """Return the header and the rows of vectors.csv."""
     columns = controller.code.columns
-    header = [
-        "trial",
-        "sample",
-        "status",
-        *(f"{kind}.{name}" for kind in ("in", "out", "state") for name in columns[kind]),
-    ]
+    names = [f"{kind}.{name}" for kind in ("in", "out", "state") for name in columns[kind]]
     rows: list[list[Any]] = []
     for k, samples in samples_by_trial.items():
         inputs, outputs, state = vectors.rows(controller.board, samples)
@@ -127,7 +117,7 @@ def vector_table(
         sample_rows = np.column_stack([inputs, outputs, state]).tolist()
         numbered = enumerate(zip(samples.limited, sample_rows, strict=True))
         rows += [[k, n, int(limited), *row] for n, (limited, row) in numbered]
-    return header, rows
+    return ["trial", "sample", "status", *names], rows
 
 
 def controller_model(controller: Controller) -> fmu_files.Model:
@@ -147,10 +137,7 @@ def plant_model(controller: Controller) -> fmu_files.Model:
         ScenarioError: if it cannot be written in C.
     """
     ready, info = controller.ready, controller.info._replace(name=f"{controller.info.name}_plant", has_filter=False)
-    try:
-        code = generate(plant_board(ready.parts, ready.dispersion, controller.board))
-    except NoRuleError as error:
-        raise ScenarioError(str(error)) from None
+    code = generate(plant_board(ready.parts, ready.dispersion, controller.board))
     if code.underivable:
         raise ScenarioError(f"the plant cannot be exported: {next(iter(code.underivable.values()))}")
     title = f"plant of {info.scenario}"
@@ -175,7 +162,7 @@ class Fmus(NamedTuple):
             if getattr(self, name):
                 model = build_model(controller)
                 for version in self.versions:
-                    fmu_files.write_fmu(folder / _fmu_file(name, version), model, version, binary=self.binary)
+                    fmu_files.write_fmu(folder / f"{name}_fmi{version}.fmu", model, version, binary=self.binary)
 
     @property
     def versions(self) -> tuple[int, ...]:
@@ -186,18 +173,10 @@ class Fmus(NamedTuple):
     def files(self) -> list[str]:
         """The names of the FMUs."""
         kinds = [name for name in ("controller", "plant") if getattr(self, name)]
-        return [_fmu_file(name, version) for name in kinds for version in self.versions]
+        return [f"{name}_fmi{version}.fmu" for name in kinds for version in self.versions]
 
 
-def _fmu_file(name: str, version: int) -> str:
-    """Return the name of an FMU; name: controller or plant, version: of FMI."""
-    return f"{name}_fmi{version}.fmu"
-
-
-NO_FMUS = Fmus()
-
-
-def write(folder: Path, controller: Controller, seed: int, trials: int, fmus: Fmus = NO_FMUS) -> None:
+def write(folder: Path, controller: Controller, seed: int, trials: int, fmus: Fmus) -> None:
     """Write all files into an existing folder.
 
     Args:
@@ -228,13 +207,17 @@ def write_program(folder: Path, controller: Controller, rounding_growth: float =
     """
     code, info = controller.code, controller.info
     info = info._replace(rounding_growth=max(info.rounding_growth, rounding_growth))
-    texts = {**templates.controller_texts(code, info), "README.md": readme(code, info)}
+    texts = templates.controller_texts(code, info) | {"README.md": templates.readme(code, info)}
     for name, text in texts.items():
         store.write_text(folder / name, templates.with_public_prefix(text, info.name))
-    parts = controller.board.part_descriptions
-    layout = {"name": info.name, "checksum": info.checksum, "period": controller.period, "parts": parts}
-    layout["reference_input"] = controller.reference_input
-    layout["columns"] = code.columns
+    layout = {
+        "name": info.name,
+        "checksum": info.checksum,
+        "period": controller.period,
+        "parts": controller.board.part_descriptions,
+        "reference_input": controller.reference_input,
+        "columns": code.columns,
+    }
     store.write_json(folder / LAYOUT, layout)
 
 

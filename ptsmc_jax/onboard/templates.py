@@ -87,40 +87,52 @@ def controller_texts(code: Code, info: ExportInfo) -> dict[str, str]:
     stem = info.stem
     files = {f"{stem}.h": "controller.h", f"{stem}.c": "controller.c", f"{stem}_parameters.c": "parameters.c",
              f"{stem}_flat.h": "flat.h"} | PROGRAMS  # fmt: skip
-    origin = {"name": info.name, "upper": info.name.upper(), "scenario": info.scenario, "checksum": info.checksum,
-              "law": info.law}  # fmt: skip
-    values = origin | _struct_values(code, info) | _check_values(code, info) | _step_values(code)
-    values |= row_values(code, info)
-    values["head"] = fill_template("head.c", name=info.name, functions=values["functions"]).rstrip()
+    values = _common_values(code, info) | _check_values(code, info) | _step_values(code) | row_values(code, info)
     return {name: fill_template(file, **values) for name, file in files.items()}
 
 
 def plant_texts(code: Code, info: ExportInfo) -> dict[str, str]:
     """Return the text of each file of a plant in C, by file name."""
-    stem, call = info.stem, code.calls
-    values = {"name": info.name, "upper": info.name.upper(), "scenario": info.scenario, "checksum": info.checksum}
-    functions = "\n".join([*_called_helpers(code), "\n\n".join(code.functions)])
-    head = fill_template("head.c", name=info.name, functions=functions).rstrip()
-    values |= _struct_values(code, info) | {
-        "head": head,
-        "derive": "    derive(p, &state->derived);" if code.derived else "",
+    calls = code.calls
+    values = _common_values(code, info) | calls | {
         "keep": "    now.derived = state->derived;" if code.derived else "",
-        "begin": call["begin"],
-        "advance": call["advance"],
         "usable": _conjunction([_check_call("all_finite", field, "in->") for field in _real_fields(code.inputs)]),
         "sound": _conjunction([_check_call("all_finite", field, "now.") for field in _real_fields(code.state)]),
-        "unused": "" if code.derived or "(p" in call["begin"] + call["advance"] else "    (void)p;",
-        "derivation": f"\n{code.derivation}" if code.derived else "",
-    }
-    files = {f"{stem}.h": "plant.h", f"{stem}.c": "plant.c"}
+        "unused": "" if code.derived or "(p" in calls["begin"] + calls["advance"] else "    (void)p;",
+    }  # fmt: skip
+    files = {f"{info.stem}.h": "plant.h", f"{info.stem}.c": "plant.c"}
     return {name: fill_template(file, **values) for name, file in files.items()}
 
 
-def _called_helpers(code: Code) -> list[str]:
-    """Return the helper functions that the code calls, and the declaration of `derive`."""
-    text = "\n".join([*code.functions, code.derivation])
-    ahead = ["static void derive(const ptsmc_params *p, ptsmc_derived *d);\n"] if code.derived else []
-    return [*(helper for name, helper in HELPERS.items() if f"{name}(" in text), *ahead]
+def _common_values(code: Code, info: ExportInfo) -> dict[str, str]:
+    """Return the template values of controllers and plants: origin, structs, functions, numbers of the parameters."""
+    note = ("\n * If the attitude filter has run before the manoeuvre, set attitude and bias afterwards. Otherwise it "
+            "starts\n * from the first sample of the star tracker.\n")  # fmt: skip
+    copies = [replace(field, name=f"of_{field.name}", meaning="") for field in code.derivation_inputs]
+    derived = struct_members([*code.derived, *copies])
+    initial = {field.name: _initializer(code.values[field.name], field.kind) for field in code.parameters}
+    called = "\n".join([*code.functions, code.derivation])
+    declared = ["static void derive(const ptsmc_params *p, ptsmc_derived *d);\n"] if code.derived else []
+    helpers = [helper for name, helper in HELPERS.items() if f"{name}(" in called]
+    functions = "\n".join([*helpers, *declared, "\n\n".join(code.functions)])
+    return {
+        "name": info.name,
+        "upper": info.name.upper(),
+        "scenario": info.scenario,
+        "checksum": info.checksum,
+        "law": info.law,
+        "params_members": struct_members(code.parameters),
+        "in_members": struct_members(code.inputs),
+        "out_members": struct_members(code.outputs),
+        "state_members": struct_members(code.state),
+        "derived_struct": fill_template("derived.h", derived_members=derived) if code.derived else "",
+        "derived_member": "    ptsmc_derived derived;" if code.derived else "",
+        "filter_note": note if info.has_filter else "",
+        "parameter_values": "\n".join(f"    {value}, /* {name} */" for name, value in initial.items()),
+        "head": fill_template("head.c", name=info.name, functions=functions).rstrip(),
+        "derive": "    derive(p, &state->derived);" if code.derived else "",
+        "derivation": f"\n{code.derivation}" if code.derived else "",  # at the end of the file, because it is long
+    }
 
 
 def struct_members(fields: Iterable[Field]) -> str:
@@ -133,28 +145,6 @@ def struct_members(fields: Iterable[Field]) -> str:
         line = f"{text} /* {meaning} */" if meaning else text
         lines += [line] if len(line) <= 110 else [*format_comment(meaning, "    "), text]
     return "\n".join(lines)
-
-
-def _struct_values(code: Code, info: ExportInfo) -> dict[str, str]:
-    """Return the template values of the header, and the numbers of the parameters."""
-    statuses = [f"    PTSMC_{name} = {k}, /* {meaning} */" for k, (name, meaning) in enumerate(STATUS.items())]
-    note = ("\n * If the attitude filter has run before the manoeuvre, set attitude and bias afterwards. Otherwise it "
-            "starts\n * from the first sample of the star tracker.\n")  # fmt: skip
-    copies = [replace(field, name=f"of_{field.name}", meaning="") for field in code.derivation_inputs]
-    derived = struct_members([*code.derived, *copies])
-    initial = {field.name: _initializer(code.values[field.name], field.kind) for field in code.parameters}
-    numbers = [f"    {value}, /* {name} */" for name, value in initial.items()]
-    return {
-        "statuses": "\n".join(statuses),
-        "params_members": struct_members(code.parameters),
-        "in_members": struct_members(code.inputs),
-        "out_members": struct_members(code.outputs),
-        "state_members": struct_members(code.state),
-        "derived_struct": fill_template("derived.h", derived_members=derived) if code.derived else "",
-        "derived_member": "    ptsmc_derived derived;" if code.derived else "",
-        "filter_note": note if info.has_filter else "",
-        "parameter_values": "\n".join(numbers),
-    }
 
 
 def _initializer(value: np.ndarray, kind: str) -> str:
@@ -222,28 +212,24 @@ def _conjunction(terms: Sequence[str]) -> str:
 
 
 def _step_values(code: Code) -> dict[str, str]:
-    """Return the template values of the functions of the stages, `ptsmc_init` and `ptsmc_step`."""
-    calls = code.calls
+    """Return the template values of the statuses, and of the calls in `ptsmc_init` and `ptsmc_step`."""
+    calls, lowest_distance = code.calls, format_constant(run_state.SINGULAR_DISTANCE, REAL)
     arguments = re.findall(r"\w+", " ".join(calls.values()))
-    derive_call = "    derive(p, &state->derived);" if code.derived else ""
-    lowest_distance = format_constant(run_state.SINGULAR_DISTANCE, REAL)
+    can_be_singular = any(field.name == "singularity_distance" for field in code.state)
+    statuses = [f"    PTSMC_{name} = {k}, /* {meaning} */" for k, (name, meaning) in enumerate(STATUS.items())]
+    derive_again = "    if (!current(p, &state->derived)) {\n        derive(p, &state->derived);\n    }"
     singular = (f"    now.tracking = now.singularity_distance >= {lowest_distance};\n"
                 "    if (!now.tracking) {\n        status = PTSMC_SINGULAR;\n    }")  # fmt: skip
     saturated = f"    if ({calls.get('act')} && status == PTSMC_OK) {{\n        status = PTSMC_SATURATED;\n    }}"
-    return {
-        "functions": "\n".join([*_called_helpers(code), "\n\n".join(code.functions)]),
-        "derivation": f"\n{code.derivation}" if code.derived else "",  # at the end of the file, because it is long
-        "derive": derive_call,
-        "derive_again": f"    if (!current(p, &state->derived)) {{\n    {derive_call}\n    }}" if derive_call else "",
+    return calls | {
+        "statuses": "\n".join(statuses),
+        "derive_again": derive_again if code.derived else "",
         "begin": calls["begin"].replace("&now", "state"),
         "unused": "" if code.derived or "(p" in calls["begin"] else "    (void)p;",
         "time": "    const real t = (real)in->t;" if "t" in arguments else "",
         "tracking": "    const int tracking = state->tracking;" if "tracking" in arguments else "",
-        **{stage: calls[stage] for stage in ("sense", "observe", "command")},
         "act": saturated if "act" in calls else "",
-        "regularity": singular
-        if any(field.name == "singularity_distance" for field in code.state)
-        else "    now.tracking = 1;",
+        "regularity": singular if can_be_singular else "    now.tracking = 1;",
     }
 
 
@@ -280,20 +266,68 @@ def _tolerance_group(column: str) -> str:
     return TORQUES[0] if name.startswith(TORQUES) else RATES[0] if name in RATES else name
 
 
-def count_operations(by_operation: Mapping[str, int]) -> dict[str, int]:
-    """Return the largest number of operations of a function, by kind."""
-    additions = sum(by_operation.get(op, 0) for op in ("add", "sub", "neg"))
-    counts = {"sums": additions, "products": by_operation.get("mul", 0), "quotients": by_operation.get("div", 0),
-              "roots": by_operation.get("sqrt", 0) + by_operation.get("cbrt", 0)}  # fmt: skip
-    basic = {"add", "sub", "neg", "mul", "div", "sqrt", "cbrt", "lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not",
-             "select", "max", "min", "abs", "sign", "convert", "entry", "isfinite", "floor", "rint"}  # fmt: skip
-    counts["comparisons and choices"] = sum(by_operation.get(op, 0) for op in basic) - sum(counts.values())
-    counts["elementary functions"] = sum(n for op, n in by_operation.items() if op not in basic)
-    return counts
+def format_counts(by_operation: Mapping[str, int]) -> str:
+    """Return the largest number of operations of a function, by kind, such as "3 sums, 2 products"."""
+    kinds = {"sums": "add sub neg", "products": "mul", "quotients": "div", "roots": "sqrt cbrt",
+             "comparisons and choices": "lt le gt ge eq ne and or not select max min abs sign convert entry isfinite "
+             "floor rint"}  # fmt: skip
+    counts = {kind: sum(by_operation.get(op, 0) for op in operations.split()) for kind, operations in kinds.items()}
+    counts["elementary functions"] = sum(by_operation.values()) - sum(counts.values())
+    return ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
 
 
-def stack_bytes(code: Code, real: int = 8) -> int:
-    """Return an upper bound on the stack of a step [byte], if each variable has its own memory."""
+def stack_bytes(code: Code) -> int:
+    """Return an upper bound on the stack of a step in double [byte], if each variable has its own memory."""
     stored = (*code.state, *code.outputs, *code.outputs, *code.derived, *code.derivation_inputs)
-    field_bytes = sum(field.size * (real if field.kind == REAL else 4) for field in stored)
-    return int(math.ceil((field_bytes + code.variables * real + 256) / 16) * 16)
+    field_bytes = sum(field.size * (8 if field.kind == REAL else 4) for field in stored)
+    return math.ceil((field_bytes + 8 * code.variables + 256) / 16) * 16
+
+
+def readme(code: Code, info: ExportInfo) -> str:
+    """Return the text of README.md: interface, cost, parameters, linking."""
+    counts = format_counts(code.derivation_counts)
+    periods = f"{info.delay} control period{'s' if info.delay != 1 else ''}"
+    return fill_template(
+        "README.md",
+        name=info.name,
+        law=info.law + " with its observer" + (" and attitude filter" if info.has_filter else ""),
+        scenario=info.scenario,
+        checksum=info.checksum,
+        stages="\n".join(f"{k}. `{name}`: {text}" for k, (name, text) in enumerate(code.stage_descriptions.items(), 1)),
+        inputs=_member_rows(code.inputs),
+        outputs=_member_rows(code.outputs),
+        statuses="\n".join(f"| `PTSMC_{name}` = {k} | {text} |" for k, (name, text) in enumerate(STATUS.items())),
+        delay=fill_template("delay.md", delay=periods).rstrip() if info.delay else "",
+        costs=format_counts(code.counts),
+        passes=", and one pass of each loop with an unknown number of passes" if code.has_open_loop else "",
+        deriving=f" After a change of parameters, and in `ptsmc_init`, there are {counts} more." if counts else "",
+        stack=stack_bytes(code),
+        derived=_derived_tables(code),
+    )
+
+
+def _derived_tables(code: Code) -> str:
+    """Return tables of the derived numbers, and of the parameters that C cannot derive."""
+
+    def table(heading: str, names: Iterable[str]) -> str:
+        rows = (f"| `{name}` | {', '.join(f'`{other}`' for other in code.sources_of[name]) or 'constant'} |\n"
+                for name in names)  # fmt: skip
+        return f"| {heading} | derived from |\n|---|---|\n{''.join(rows)}"
+
+    text = ""
+    if code.derived:
+        text += (
+            "Some numbers are derived from the parameters: by `ptsmc_init`, and by `ptsmc_step` after a change of "
+            f"parameters.\n\n{table('derived', [member.name for member in code.derived])}"
+        )
+    if code.underivable:
+        reasons = " ".join(f"{reason}." for reason in dict.fromkeys(code.underivable.values()))
+        text += (
+            "\nThese parameters also depend on others, but C cannot derive them. Export again if the others change."
+            f"\n\n{table('parameter', code.underivable)}\n{reasons}\n"
+        )
+    return text.rstrip()
+
+
+def _member_rows(members: Iterable[Field]) -> str:
+    return "\n".join(f"| `{member.name}` | {' '.join(member.meaning.split())} |" for member in members)

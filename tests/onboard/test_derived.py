@@ -13,7 +13,7 @@ from ptsmc_jax.observers.base import ErrorBound
 from ptsmc_jax.onboard import folder, vectors
 from ptsmc_jax.onboard.board import build_board
 from ptsmc_jax.onboard.library import Library, compiler
-from ptsmc_jax.onboard.readme import readme
+from ptsmc_jax.onboard.templates import readme
 from scenarios.own_parts import LowPass
 from tests.helpers import short
 from tests.onboard.compiled import STRICT, needs_compiler, program, step_many

@@ -161,8 +161,7 @@ def export(
     with store.lock_folder(folder, force=force):
         store.write_folder(folder, lambda staging: controllers.write(staging, controller, seed, trials, fmus))
     if not quiet:
-        counts = templates.count_operations(controller.code.counts)
-        costs = ", ".join(f"{count} {operation}" for operation, count in counts.items() if count)
+        costs = templates.format_counts(controller.code.counts)
         check = f"make -C {shlex.quote(str(folder))} check"
         outputs = ", ".join(["controller", *fmus.files])
         terminal.print_lines(f"a step takes at most {costs}", f"{outputs} in {folder}; {check}")
