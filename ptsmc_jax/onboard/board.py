@@ -31,7 +31,7 @@ from ptsmc_jax.devices.kalman_filter import KalmanFilter, Track
 from ptsmc_jax.laws.base import Law, Sample
 from ptsmc_jax.numerics import attitude, guards
 from ptsmc_jax.observers.base import Observer
-from ptsmc_jax.onboard import derived
+from ptsmc_jax.onboard import derived, origins
 from ptsmc_jax.plants.base import Plant, State
 from ptsmc_jax.plants.rigid_body import AttitudeState
 from ptsmc_jax.signals.references import Target
@@ -131,7 +131,7 @@ def build_board(parts: Parts, reference_input: bool = False) -> Board:
     parameters, inputs = board_parameters(parts), observer.model.inputs
     computer = Board(observer.model, parameters, rules=derived.rules(parts))
     computer.meanings["period"] = "control period [s]"
-    computer.meanings["observer_matrix"] = _docstring_summary(type(observer).update_matrix).rstrip(".")
+    computer.meanings["observer_matrix"] = origins.summary(type(observer).update_matrix.__doc__).rstrip(".")
     if parameters["filter"] is None:
         _add_sensor_stage(computer, parts)
     elif isinstance(parameters["filter"], KalmanFilter):
@@ -197,10 +197,6 @@ def board_parameters(parts: Parts) -> dict[str, Any]:
         if sensors.own_times is not None:
             parameters["star_tracker_interval"] = sensors.own_times.interval
     return parameters
-
-
-def _docstring_summary(documented: Any) -> str:
-    return " ".join((documented.__doc__ or "").strip().split("\n\n")[0].split())
 
 
 def _nearest_form(parameters: Values, values: Values, x: State, before: State) -> State:
@@ -285,7 +281,7 @@ def _add_kalman_filter_stage(computer: Board, estimator: KalmanFilter) -> None:
     for sensor in estimator.sensors:
         name, identity = sensor.name, jnp.array([0.0, 0.0, 0.0, 1.0])
         computer.inputs |= {name: jax.eval_shape(sensor.read, identity), f"{name}_valid": flag()}
-        computer.meanings[name] = _docstring_summary(type(sensor))
+        computer.meanings[name] = origins.summary(type(sensor).__doc__)
         computer.meanings[f"{name}_valid"] = f"whether {name} has a reading at this sample: 0 or 1"
         if sensor.times.every is None:
             computer.inputs[f"{name}_age"] = real()

@@ -70,12 +70,7 @@ class Block:
 
     def find(self, key: Any) -> Node | None:
         """Return the node with this key in this block or an enclosing block, or None."""
-        block: Block | None = self
-        while block is not None:
-            if key in block.nodes_by_key:
-                return block.nodes_by_key[key]
-            block = block.outer
-        return None
+        return self.nodes_by_key.get(key) or (self.outer.find(key) if self.outer else None)
 
 
 class Region:
@@ -128,7 +123,7 @@ class Pool:
     """Creates the nodes of expressions in the current block. Equal expressions in the same scope are one node."""
 
     def __init__(self) -> None:
-        self.block = Block()
+        self.block = self.outermost = Block()
         self.section: Any = None
 
     def constant(self, value: Any, kind: str) -> Node:
@@ -136,12 +131,15 @@ class Pool:
         value = bool(value) if kind == BOOL else float(value) if kind == REAL else int(value)
         # distinguish 0.0 and -0.0, which are equal; find nan, which is not equal to itself
         key = ("constant", kind, math.copysign(1.0, value) if value == 0 else 0, "nan" if value != value else value)
-        return self.block.find(key) or self._store(key, Node("constant", (), kind, value, self._outermost_block()))
+        return self._atom(key, kind, value)
 
     def place(self, name: str, kind: str) -> Node:
         """Return the node of a place in memory."""
-        key = ("place", name)
-        return self.block.find(key) or self._store(key, Node("place", (), kind, name, self._outermost_block()))
+        return self._atom(("place", name), kind, name)
+
+    def _atom(self, key: Any, kind: str, value: Any) -> Node:
+        """Return the node of a constant or a place, whose operation is the first entry of the key."""
+        return self.block.find(key) or self._store(key, Node(key[0], (), kind, value, self.outermost))
 
     def new_variable(self, kind: str, op: str = "variable") -> Node:
         """Return a new variable, index or table of a loop or a branch.
@@ -153,12 +151,6 @@ class Pool:
         node = Node(op, (), kind, None, self.block)
         node.section = self.section
         return node
-
-    def _outermost_block(self) -> Block:
-        block = self.block
-        while block.outer is not None:
-            block = block.outer
-        return block
 
     def _store(self, key: Any, node: Node) -> Node:
         """Record a new node under its key, so that `Block.find` finds it, and return the node."""

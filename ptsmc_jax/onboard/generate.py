@@ -59,7 +59,8 @@ def generate(board: Board) -> Code:
     """Return the C of a flight computer. Raises NoRuleError if an operation has no counterpart in C."""
     params, structs = collect_parameters(board), _fields_by_struct(board)
     params.used.update(board.always_exported)
-    code = Code(params.values, *map(_declared_fields, structs.values()), column_names(board))
+    inputs, state, outputs = map(_declared_fields, structs.values())
+    code = Code(params.values, inputs, state, outputs, column_names(board))
     code.stage_descriptions = {stage.name: stage.description for stage in board.stages if stage.name != "begin"}
     for stage in board.stages:
         _add_stage_function(code, board, stage, structs, params)

@@ -24,12 +24,15 @@ class Section(NamedTuple):
     summary: str  # the first sentence of its docstring
 
 
+Span = tuple[int, int, int, int]  # position of an expression: first line and column, last line and column
+
+
 class Frame(NamedTuple):
     """A frame of the call stack."""
 
     file: str
     name: str
-    span: tuple[int, int, int, int]  # position of the expression: first line and column, last line and column
+    span: Span
 
 
 def stack_frames(eqn: Any) -> list[Frame]:
@@ -49,41 +52,26 @@ def _is_foreign(file: str) -> bool:
 
 
 @functools.cache
-def _instruction_spans(code: Any) -> list[tuple[int, int, int, int]]:
+def _instruction_spans(code: Any) -> list[Span]:
     return [(a or 0, c or 0, b or 0, d or 0) for a, b, c, d in code.co_positions()]
 
 
-def call_line(calls: list[Frame]) -> str:
-    """Return file and line of a call for an error, if possible in the user's code; empty if unknown."""
-    frame = _frame_for_error(calls)
-    return "" if frame is None else f"{frame.file}:{frame.span[0]}"
-
-
-def called_function(calls: list[Frame]) -> str:
-    """Return the function that the source calls there, such as "jnp.linalg.solve"; empty if it is not a call."""
-    frame = _frame_for_error(calls)
-    tree = None if frame is None else _syntax_tree(frame.file)
-    if frame is None or tree is None:
-        return ""
-    functions = (node.func for node in ast.walk(tree) if isinstance(node, ast.Call) and _span(node) == frame.span)
-    return next(map(ast.unparse, functions), "")
-
-
-def _frame_for_error(calls: list[Frame]) -> Frame | None:
-    """Return the frame that an error names: the innermost frame in the user's code, if the user's code made the call.
-
-    Otherwise it is the innermost frame of the library. The result is None without frames.
-    """
-    user_frames = [frame for frame in calls if not Path(frame.file).is_relative_to(LIBRARY)]
-    # if the user's code only calls the library, the library is the cause
-    candidates = user_frames if user_frames and calls[0] in user_frames else calls
-    return candidates[0] if candidates else None
+def describe_call(calls: list[Frame]) -> tuple[str, str]:
+    """Return function and line of the innermost call for an error, such as "jnp.linalg.solve"; empty if unknown."""
+    if not calls:
+        return "", ""
+    file, _, span = calls[0]
+    functions = (
+        node.func for node in ast.walk(_syntax_tree(file)) if isinstance(node, ast.Call) and _span(node) == span
+    )
+    return next(map(ast.unparse, functions), ""), f"{file}:{span[0]}"
 
 
 def find_section(calls: list[Frame]) -> Section | None:
     """Return the section of an equation: the innermost function that is not in `HELPER_FOLDERS`."""
     for frame in calls:
-        path, name = _heading_path(frame.file), _qualified_name(frame.name)
+        path = _heading_path(frame.file)
+        name = re.sub(r"\.?<(locals|lambda|genexpr|listcomp)>", "", frame.name).strip(".")
         if path and name:
             return Section(name, path, _function_summary(frame.file, frame.span[0]))
     return None
@@ -103,71 +91,69 @@ def value_name(calls: list[Frame]) -> str:
     """Return the name of an equation's value in the source; empty if it has none."""
     tuple_index: int | None = None
     for frame in calls:
-        use = _expression_uses(frame.file).get(frame.span)
-        if use is None:
-            return ""
-        kind, names, index = use
-        if kind == "return":
-            tuple_index = index if index is not None else tuple_index
+        names, index = _expression_uses(frame.file).get(frame.span, ((), None))
+        if names is None:  # a return statement: the caller may have a name
+            tuple_index = tuple_index if index is None else index
             continue
-        if index is not None:
-            return names[index]
-        if len(names) == 1:
-            return names[0]
-        return names[tuple_index] if tuple_index is not None and tuple_index < len(names) else ""
+        if index is None:
+            index = 0 if len(names) == 1 else tuple_index
+        return names[index] if index is not None and index < len(names) else ""
     return ""
 
 
 @functools.cache
-def _syntax_tree(file: str) -> ast.Module | None:
+def _syntax_tree(file: str) -> ast.Module:
+    """Return the syntax tree of a file, without content if it cannot be read."""
     try:
         return ast.parse(Path(file).read_bytes())
     except (OSError, SyntaxError, ValueError):
-        return None
+        return ast.Module([], [])
 
 
 @functools.cache
-def _expression_uses(file: str) -> dict[tuple[int, int, int, int], tuple[str, tuple[str, ...], int | None]]:
-    """Return the use of each expression by its position: ("assign" or "return", names, index in a tuple)."""
-    uses: dict[tuple[int, int, int, int], tuple[str, tuple[str, ...], int | None]] = {}
-    tree = _syntax_tree(file)
-    for node in ast.walk(tree) if tree is not None else ():
+def _expression_uses(file: str) -> dict[Span, tuple[tuple[str, ...] | None, int | None]]:
+    """Return the use of each expression by its position: names that it is assigned to, and its index in a tuple.
+
+    The names are None in a return statement.
+    """
+    uses: dict[Span, tuple[tuple[str, ...] | None, int | None]] = {}
+    for node in ast.walk(_syntax_tree(file)):
         if isinstance(node, ast.Call):  # SurfaceGains(c=.., e=..)
-            uses |= {_span(keyword.value): ("assign", (keyword.arg,), None) for keyword in node.keywords if keyword.arg}
+            uses |= {_span(keyword.value): ((keyword.arg,), None) for keyword in node.keywords if keyword.arg}
         if isinstance(node, ast.Return) and node.value is not None:
-            kind, names, value = "return", (), node.value
+            names = None
         elif isinstance(node, ast.Assign) and len(node.targets) == 1:
-            target, value, kind = node.targets[0], node.value, "assign"
+            target = node.targets[0]
             targets = target.elts if isinstance(target, ast.Tuple) else [target]
             names = tuple(element.id if isinstance(element, ast.Name) else "" for element in targets)
         else:
             continue
-        if isinstance(value, ast.Tuple):
-            for k, element in enumerate(value.elts):
-                if kind == "return" or len(names) == len(value.elts):
-                    uses[_span(element)] = (kind, names, k)
-        else:
-            uses[_span(value)] = (kind, names, None)
+        if not isinstance(node.value, ast.Tuple):
+            uses[_span(node.value)] = names, None
+        elif names is None or len(names) == len(node.value.elts):
+            uses |= {_span(element): (names, k) for k, element in enumerate(node.value.elts)}
     return uses
 
 
-def _span(node: Any) -> tuple[int, int, int, int]:
+def _span(node: Any) -> Span:
     return node.lineno, node.col_offset, node.end_lineno, node.end_col_offset
 
 
 @functools.cache
-def _qualified_name(name: str) -> str:
-    return re.sub(r"\.?<(locals|lambda|genexpr|listcomp)>", "", name).strip(".")
-
-
-@functools.cache
 def _function_summary(file: str, line_number: int) -> str:
-    tree, innermost = _syntax_tree(file), None
-    for node in ast.walk(tree) if tree is not None else ():
-        if isinstance(node, ast.FunctionDef) and node.lineno <= line_number <= (node.end_lineno or 0):
-            innermost = node if innermost is None or node.lineno >= innermost.lineno else innermost
-    text = None if innermost is None else ast.get_docstring(innermost)
-    return "" if not text else " ".join(text.split("\n\n")[0].split())
+    """Return the summary of the innermost function that contains a line."""
+    functions = (
+        node
+        for node in ast.walk(_syntax_tree(file))
+        if isinstance(node, ast.FunctionDef) and node.lineno <= line_number <= (node.end_lineno or 0)
+    )
+    innermost = max(functions, key=lambda node: node.lineno, default=None)
+    return "" if innermost is None else summary(ast.get_docstring(innermost))
+
+
+def summary(docstring: str | None) -> str:
+    """Return the first paragraph of a docstring in one line."""
+    return " ".join((docstring or "").strip().split("\n\n")[0].split())
 
 
 def class_docstrings(part: Any, common_bases: tuple[type, ...]) -> list[tuple[str, str]]:
@@ -194,13 +180,12 @@ def field_comments(cls: type) -> dict[str, str]:
         lines_above: list[str] = []
         for text in source.splitlines():
             comment_line = re.match(r"\s+#\s?(.*)$", text)
-            field = re.match(r"\s+(\w+)\s*:\s*[^#]*?(?:#\s*(.*))?$", text)
             if comment_line:
                 lines_above.append(comment_line[1])
                 continue
-            if field and not text.strip().endswith(":"):
-                meaning = field[2] or " ".join(lines_above)
-                if meaning:
-                    meanings[field[1]] = meaning.strip()
+            field = re.match(r"\s+(\w+)\s*:\s*[^#]*?(?:#\s*(.*))?$", text)
+            meaning = (field and field[2]) or " ".join(lines_above)
+            if field and meaning and not text.strip().endswith(":"):
+                meanings[field[1]] = meaning.strip()
             lines_above = []
     return meanings

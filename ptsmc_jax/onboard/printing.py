@@ -1,5 +1,6 @@
 """Expressions as the body of a C function, with variables and sections named as in the source. Read `Printer` first."""
 
+import math
 import re
 import textwrap
 from collections import Counter
@@ -31,17 +32,12 @@ INFIX = {"add": ("+", 12), "sub": ("-", 12), "mul": ("*", 13), "div": ("/", 13),
          "or": ("||", 4)}  # fmt: skip
 HELPER_NAMES = {"max": "larger", "min": "smaller", "sign": "sign_of"}  # helper functions in C, by operation
 HELPER_OPERATIONS = ("threefry", "erf_inv")  # further helper functions in C, with the names of their operations
-# integer types: format of a constant, and the smallest real number that is too large for the type
-INTEGER_TYPES = {"int32_t": ("{}", "2147483648"), "int64_t": ("{}", "9223372036854775808.0"),
-         "uint32_t": ("{}u", "4294967296")}  # fmt: skip
+# integer types: the least and the largest integer in C, and the smallest real number that is too large for the type
+INTEGER_TYPES = {"int32_t": ("INT32_MIN", "INT32_MAX", "2147483648"),
+                 "int64_t": ("INT64_MIN", "INT64_MAX", "9223372036854775808.0"),
+                 "uint32_t": ("0", "UINT32_MAX", "4294967296")}  # fmt: skip
 ATOMS = ("constant", "place", "variable", "index", "table")
 ATOM, UNARY, CONDITIONAL = 20, 14, 3  # operator precedences in C: no operator, unary operator, ?:
-
-
-def _integer_limits(kind: str) -> tuple[str, str]:
-    """Return C's names of the least and the largest integer of a type."""
-    name = kind.removesuffix("_t").upper()
-    return "0" if kind.startswith("u") else f"{name}_MIN", f"{name}_MAX"
 
 
 def _suffix(kind: str) -> str:
@@ -53,8 +49,7 @@ def _read_helpers() -> dict[str, str]:
     """Return the C helper functions by name; an exported file contains those that it calls."""
     text = [(FILES / "helpers.c").read_text(encoding="utf-8")]
     integers = Template((FILES / "integers.c").read_text(encoding="utf-8"))
-    for kind, (_, beyond) in INTEGER_TYPES.items():
-        low, high = _integer_limits(kind)
+    for kind, (low, high, beyond) in INTEGER_TYPES.items():
         sign = "x > 0" if low == "0" else "(x > 0) - (x < 0)"
         values = {"kind": kind, "suffix": _suffix(kind), "sign": sign, "low": low, "high": high, "beyond": beyond}
         text.append(integers.substitute(values))
@@ -71,12 +66,10 @@ def format_constant(value: Any, kind: str) -> str:
     if kind == BOOL:
         return "1" if value else "0"
     if kind != REAL:
-        is_lowest = kind[0] == "i" and value == -(2 ** (int(kind[3:5]) - 1))
-        return _integer_limits(kind)[0] if is_lowest else INTEGER_TYPES[kind][0].format(int(value))
-    if value != value:
-        return "R(NAN)"
-    if value in (float("inf"), float("-inf")):
-        return "R(INFINITY)" if value > 0 else "R(-INFINITY)"
+        is_least = (kind, value) in (("int32_t", -(2**31)), ("int64_t", -(2**63)))
+        return INTEGER_TYPES[kind][0] if is_least else f"{int(value)}{'u' if kind == 'uint32_t' else ''}"
+    if not math.isfinite(value):
+        return {math.inf: "R(INFINITY)", -math.inf: "R(-INFINITY)"}.get(value, "R(NAN)")
     is_whole = value == int(value) and abs(value) < 1e15 and str(value) != "-0.0"
     short = str(int(value)) if is_whole else repr(value)
     return f"R({short})"

@@ -152,7 +152,7 @@ class Translator:
         if name in _CUMULATIVE:
             return components.accumulate_entries(eqn, values[0], lambda *pair: fold(_CUMULATIVE[name], pair))
         if name == "dot_general":
-            return components.contract_entries(eqn, *values, dot_product)
+            return components.contract_entries(eqn, values[0], values[1], dot_product)
         if name in ("argmax", "argmin"):
             return self._index_of_extreme(eqn, values[0], kind)
         if name in _INDEXED_MOVES or name in _INDEXED_ADDITIONS:
@@ -162,10 +162,11 @@ class Translator:
 
     def unsupported_error(self, eqn: Any, frames: list[origins.Frame]) -> NoRuleError:
         """Return the error for a primitive without a rule: function and line in the source, and allowed functions."""
-        line, primitive = origins.call_line(frames), eqn.primitive.name
+        primitive, (function, line) = eqn.primitive.name, origins.describe_call(frames)
         allowed = ALLOWED_LINEAR_ALGEBRA if primitive in LINEAR_ALGEBRA else ALLOWED_OPERATIONS
-        name = origins.called_function(frames) or primitive
-        return NoRuleError(f"`{name}`{f' ({line})' if line else ''} cannot be written in C, but must be {allowed}")
+        return NoRuleError(
+            f"`{function or primitive}`{f' ({line})' if line else ''} cannot be written in C, but must be {allowed}"
+        )
 
     def _index_of_extreme(self, eqn: Any, value: np.ndarray, kind: str) -> np.ndarray:
         test = "gt" if eqn.primitive.name == "argmax" else "lt"
@@ -286,7 +287,7 @@ def _map_entries(rule: Callable, values: Sequence[np.ndarray], shape: tuple[int,
 def _c_function(inner: Any) -> str | None:
     """Return the C function of a called jaxpr, or None if C evaluates its equations."""
     info = open_jaxpr(inner)[0].debug_info
-    return C_FUNCTIONS.get((info.func_filename, info.func_name))
+    return C_FUNCTIONS.get((info.func_filename or "", info.func_name))
 
 
 def _fill_value(eqn: Any) -> Any:
