@@ -12,12 +12,14 @@ import shlex
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from ptsmc_jax.devices.actuators import ActuatorState
 from ptsmc_jax.dispersions.variation import Dispersion
@@ -76,13 +78,12 @@ class Library:
             layout = json.loads((self.folder / sources.LAYOUT).read_text(encoding="utf-8"))
             self.name, self.checksum, self.columns = layout["name"], layout["checksum"], layout["columns"]
             self.period = float(layout["period"])  # control period [s]
-            self.reference_input = bool(layout.get("reference_input", False))
-            # see `Board.part_descriptions`; files of earlier versions have none
-            self.part_descriptions = dict(layout.get("parts", {}))
+            self.reference_input = bool(layout["reference_input"])
+            self.part_descriptions = dict(layout["parts"])  # see `Board.part_descriptions`
             sizes = [len(self.columns[kind]) for kind in ("in", "out", "state", "params")]
             if not re.fullmatch(r"\w+", self.name, re.ASCII):
                 raise invalid
-        except (OSError, ValueError, RecursionError, OverflowError, KeyError, TypeError):
+        except (OSError, ValueError, OverflowError, KeyError, TypeError):
             raise invalid from None
         # the library stays loaded after its file has been deleted
         with tempfile.TemporaryDirectory(prefix="ptsmc-") as build_folder:
@@ -165,25 +166,28 @@ class InTheLoop:
                     f"the controller in {library.folder} has other {noun} than the scenario, but must be an export of "
                     "one with the same plant, law, observer, filter and actuators"
                 )
-        scenario_parts, controller_parts = self.board.part_descriptions, library.part_descriptions
-        names = {**scenario_parts, **controller_parts} if controller_parts else {}
-        different = next((name for name in names if controller_parts.get(name) != scenario_parts.get(name)), None)
-        if different is not None:
-            raise ScenarioError(
-                f"the controller in {library.folder} has the {different} {controller_parts.get(different, 'none')}, "
-                f"but must have the {different} of the scenario, {scenario_parts.get(different, 'none')}"
+        for name in self.board.part_descriptions | library.part_descriptions:
+            own, required = (
+                parts.get(name, "none") for parts in (library.part_descriptions, self.board.part_descriptions)
             )
+            if own != required:
+                raise ScenarioError(
+                    f"the controller in {library.folder} has the {name} {own}, but must have the {name} of the "
+                    f"scenario, {required}"
+                )
         # either number may have been rounded to 32 bits
         period, c_period = np.float32(parts.period), np.float32(library.period)
         if period != c_period:
             raise ScenarioError(
                 f"loop.period is {period!s} s, but must be {c_period!s} s as in the controller in {library.folder}"
             )
-        columns, paths = library.columns["params"], jax.tree_util.tree_leaves_with_path(self.board.parameters)
-        first_elements = [member.elements()[:1] for member in name_parameters(self.board).fields]
         # the first column of each parameter in C, by its path
-        pairs = zip(paths, first_elements, strict=True)
-        self._columns = {path: columns.index(*first) for (path, _), first in pairs if first and first[0] in columns}
+        self._columns, columns = dict[Any, int](), {name: k for k, name in enumerate(library.columns["params"])}
+        leaves = jax.tree_util.tree_leaves_with_path(self.board.parameters)
+        for (path, _), member in zip(leaves, name_parameters(self.board).fields, strict=True):
+            if member.size and member.elements()[0] in columns:
+                self._columns[path] = columns[member.elements()[0]]
+        self._read_outputs, self._read_state = map(_tree_reader, (self.board.outputs, self.board.state))
         if dispersion is not None and dispersion.custom is not None:
             self._check_custom_dispersion(Dispersion(custom=dispersion.custom))
 
@@ -213,14 +217,12 @@ class InTheLoop:
     @property
     def parameter_differences(self) -> str:
         """A sentence that lists the parameters of C that differ from the scenario; empty if there are none."""
-        compiled, params = (
-            dict(zip(self.library.columns["params"], self.library.parameters, strict=True)),
-            name_parameters(self.board),
-        )
-        elements_of, differing = {field.name: field.elements() for field in params.fields}, list[str]()
-        for name, values in params.values.items():
+        compiled = dict(zip(self.library.columns["params"], self.library.parameters, strict=True))
+        params, differing = name_parameters(self.board), list[str]()
+        for member in dict.fromkeys(params.fields):
+            values = params.values[member.name]
             tolerance = PARAMETER_TOLERANCE * np.max(np.abs(values), initial=0.0, where=np.isfinite(values))
-            for element, value in zip(elements_of[name], np.ravel(values), strict=True):
+            for element, value in zip(member.elements(), values.flat, strict=True):
                 if element in compiled and not np.isclose(compiled[element], value, rtol=0.0, atol=tolerance):
                     differing.append(f"{element} = {compiled[element]:.6g} instead of {value:.6g}")
         if not differing:
@@ -248,7 +250,8 @@ class InTheLoop:
         computer = PYTHON_SOFTWARE.boot(parts, seed, trial, x0, first)
         state = jnp.asarray(self.library.initial_state())
         for name, value in parts.sensors.filter_state(computer.sensors).items():
-            state = self._set_columns(state, name, value)
+            start = self.library.columns["state"].index(name + "[0]" * value.ndim)
+            state = state.at[start : start + value.size].set(jnp.ravel(value))
         return computer._replace(sensors=(computer.sensors, state, jnp.zeros(len(SAMPLE_STATUSES), jnp.int32)))
 
     def decide(
@@ -278,8 +281,7 @@ class InTheLoop:
         other_index = SAMPLE_STATUSES.index("other")
         counted_index = jnp.where((status >= 0) & (status < other_index), status, other_index)
         counts = counts.at[counted_index].add(has_length.astype(counts.dtype))
-        outputs = self._unpack_trees(self.board.outputs, out, 0)
-        memory = self._unpack_trees(self.board.state, after, 3)
+        outputs, memory = self._read_outputs(out), self._read_state(after[3:])
         channels = outputs.get("wheel_torque", outputs.get("torque"))
         measured = self.board.model.state_of(memory)
         decision = Decision(parts.reference(now.t), outputs["d_hat"], outputs["command"], outputs["s"],
@@ -301,18 +303,9 @@ class InTheLoop:
             changed = changed.at[start : start + value.size].set(value)
         return changed
 
-    def _set_columns(self, state: Any, name: str, value: Any) -> Any:
-        start = self.library.columns["state"].index(name + "[0]" * value.ndim)
-        return state.at[start : start + value.size].set(jnp.ravel(value))
 
-    def _unpack_trees(self, shapes: dict[str, Any], row: Any, start: int) -> dict[str, Any]:
-        """Return named trees from the numbers of a row, starting at an index."""
-        trees = {}
-        for name, shape in shapes.items():
-            leaves, structure = jax.tree.flatten(shape)
-            values = []
-            for leaf in leaves:
-                values.append(row[start : start + leaf.size].reshape(leaf.shape).astype(leaf.dtype))
-                start += leaf.size
-            trees[name] = jax.tree.unflatten(structure, values)
-        return trees
+def _tree_reader(shapes: dict[str, Any]) -> Callable[[Any], dict[str, Any]]:
+    """Return the function from a row, which may be longer than necessary, to trees of these shapes by name."""
+    zeros = [jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape) for shape in shapes.values()]
+    flat, unravel = ravel_pytree(zeros)
+    return lambda row: dict(zip(shapes, unravel(row[: flat.size]), strict=True))
