@@ -50,8 +50,7 @@ class Stage:
 
     name: str
     description: str
-    reads: tuple[str, ...]
-    run: Callable[[Values, Values], Values]  # (parameters, values that it reads) -> values that it writes, by name
+    run: Callable[[Values, Values], Values]  # (parameters, all values) -> values that it writes, by name
     parts: tuple[Any, ...] = ()  # parts whose docstrings the C function has as a comment
 
 
@@ -74,12 +73,8 @@ class Board:
         """The unit of inputs and disturbances, in brackets."""
         return f" [{self.model.input_unit}]" if self.model.input_unit else ""
 
-    def signal_names(self, prefix: str) -> tuple[str, ...]:
-        """Return the names of the measured signals with a prefix, "in", "before" or "now"."""
-        return tuple(f"{prefix}.{name}" for name in self.model.signals)
-
     def measured_state(self, values: Values, prefix: str) -> State:
-        """Return the measured state, whose signals are in `values` under the names of `signal_names`."""
+        """Return the measured state from its signals in `values`, which have the prefix "in", "before" or "now"."""
         return self.model.state_of({name: values[f"{prefix}.{name}"] for name in self.model.signals})
 
     @property
@@ -140,7 +135,7 @@ def build_board(parts: Parts, reference_input: bool = False) -> Board:
         _add_filter_stage(computer, parts)
     _add_observer_stage(computer, observer, device)
     _add_law_stage(computer, law, observer, parts.command_filter)
-    computer.stages.append(Stage("begin", "Initial memory of observer, law and filters.", (), begin))
+    computer.stages.append(Stage("begin", "Initial memory of observer, law and filters.", begin))
     if not device.is_ideal:
         _add_actuator_stage(computer, device, inputs)
     return _with_reference_input(computer) if reference_input else computer
@@ -149,27 +144,30 @@ def build_board(parts: Parts, reference_input: bool = False) -> Board:
 def _with_reference_input(computer: Board) -> Board:
     """Return the flight computer with the reference as an input. Both signs of its quaternion give the same result."""
     target = jax.eval_shape(computer.parameters["reference"], real())
-    meanings = {"reference_q": "reference attitude", "reference_w": "its rate, in reference axes [rad/s]",
-             "reference_w_dot": "time derivative of that rate [rad/s^2]"}  # fmt: skip
-    computer.inputs["reference"], computer.parameters = target, {**computer.parameters}
-    del computer.parameters["reference"]
-    computer.meanings |= meanings if isinstance(target, Target) else {"reference": "reference at this sample"}
-    if isinstance(target, Target):
+    is_attitude = isinstance(target, Target)
+    computer.inputs["reference"] = target
+    computer.parameters = {name: value for name, value in computer.parameters.items() if name != "reference"}
+    if is_attitude:
         computer.state["reference"] = real(4)
-        computer.meanings["reference"] = "reference attitude at the last sample"
+        computer.meanings |= {
+            "reference_q": "reference attitude",
+            "reference_w": "its rate, in reference axes [rad/s]",
+            "reference_w_dot": "time derivative of that rate [rad/s^2]",
+            "reference": "reference attitude at the last sample",
+        }
+    else:
+        computer.meanings["reference"] = "reference at this sample"
 
     def with_input(stage: Stage) -> Stage:
         def run_stage(parameters: Values, values: Values) -> Values:
-            target = values["in.reference"]
-            if isinstance(target, Target):
+            target, kept = values["in.reference"], {}
+            if is_attitude:
                 q = attitude.unit(target.q)
                 target = target._replace(q=jnp.where(jnp.dot(q, values["before.reference"]) < 0.0, -q, q))
-            results = stage.run({**parameters, "reference": lambda t: target}, values)
-            keeps_reference = stage.name == "sense" and isinstance(target, Target)
-            return results | ({"now.reference": target.q} if keeps_reference else {})
+                kept = {"now.reference": target.q} if stage.name == "sense" else {}
+            return stage.run({**parameters, "reference": lambda t: target}, values) | kept
 
-        reads = ("in.reference", *(("before.reference",) if isinstance(target, Target) else ()))
-        return dataclasses.replace(stage, reads=(*stage.reads, *reads), run=run_stage)
+        return dataclasses.replace(stage, run=run_stage)
 
     computer.stages = [with_input(stage) if stage.name in ("sense", "command") else stage for stage in computer.stages]
     return computer
@@ -218,14 +216,11 @@ def _add_sensor_stage(computer: Board, parts: Parts) -> None:
     computer.meanings |= model.signals
 
     def sense(parameters: Values, values: Values) -> Values:
-        before = computer.measured_state(values, "before")
-        x = _nearest_form(
-            parameters, values, model.normalise_measurement(computer.measured_state(values, "in")), before
-        )
+        before, measured = (computer.measured_state(values, prefix) for prefix in ("before", "in"))
+        x = _nearest_form(parameters, values, model.normalise_measurement(measured), before)
         return {f"now.{name}": value for name, value in model.signals_of(x).items()}
 
-    reads = ("tracking", "t", *computer.signal_names("in"), *computer.signal_names("before"))
-    computer.stages.append(Stage("sense", "The measured state, which the law uses without a filter.", reads, sense))
+    computer.stages.append(Stage("sense", "The measured state, which the law uses without a filter.", sense))
 
 
 def _add_filter_stage(computer: Board, parts: Parts) -> None:
@@ -269,9 +264,7 @@ def _add_filter_stage(computer: Board, parts: Parts) -> None:
         return {"now.attitude": x.q, "now.rate": rate, "now.bias": estimate.bias, "now.gyro": gyro}
 
     summary = "Attitude filter: propagates the attitude with the gyro and corrects it with the star tracker."
-    reads = ("in.attitude", "in.attitude_valid", "in.rate", "before.attitude", "before.bias", "before.gyro", "dt",
-             "tracking", "t", *(("in.attitude_age",) if age else ()))  # fmt: skip
-    computer.stages.append(Stage("sense", summary, reads, sense, (sensors.filter,)))
+    computer.stages.append(Stage("sense", summary, sense, (sensors.filter,)))
 
 
 def _add_kalman_filter_stage(computer: Board, estimator: KalmanFilter) -> None:
@@ -299,8 +292,6 @@ def _add_kalman_filter_stage(computer: Board, estimator: KalmanFilter) -> None:
         "covariance": "covariance of the errors of attitude [rad], bias [rad/s], last gyro sample [rad/s] and past "
         "attitudes [rad]",
     }
-    states = [name for name in computer.state if name != "rate"]
-    reads = (*(f"in.{name}" for name in computer.inputs), *(f"before.{name}" for name in states), "dt", "tracking", "t")
 
     def sense(parameters: Values, values: Values) -> Values:
         estimator, before, one = parameters["filter"], values["before.attitude"], jnp.ones_like(values["dt"])
@@ -340,7 +331,7 @@ def _add_kalman_filter_stage(computer: Board, estimator: KalmanFilter) -> None:
         return {f"now.{name}": value for name, value in now.items() if value is not None}
 
     summary = "Attitude Kalman filter: propagates the attitude with the gyro and corrects it with the attitude sensors."
-    computer.stages.append(Stage("sense", summary, reads, sense, (estimator,)))
+    computer.stages.append(Stage("sense", summary, sense, (estimator,)))
 
 
 def _add_observer_stage(computer: Board, observer: Observer, device: Actuators) -> None:
@@ -387,11 +378,8 @@ def _add_observer_stage(computer: Board, observer: Observer, device: Actuators) 
         results = {"now.observer": memory, "out.d_hat": observer.estimate(memory)}
         return results | {f"now.{name}": values[f"in.{name}"] for name in telemetry_shapes}
 
-    telemetry_reads = [f"{prefix}.{name}" for prefix in ("before", "in") for name in telemetry_shapes]
-    states = (*computer.signal_names("before"), *computer.signal_names("now"))
-    reads = ("t", "dt", "regular", "before.observer", *states, torque_name, *telemetry_reads)
     summary = "Disturbance observer: estimates the disturbance from the motion since the last sample."
-    computer.stages.append(Stage("observe", summary, reads, observe, (observer,)))
+    computer.stages.append(Stage("observe", summary, observe, (observer,)))
 
 
 def _add_law_stage(computer: Board, law: Law, observer: Observer, command_filter: CommandFilter | None) -> None:
@@ -423,10 +411,6 @@ def _add_law_stage(computer: Board, law: Law, observer: Observer, command_filter
         computer.state |= {"singularity_distance": real(), "singularity_distance_unit": real()}
         computer.meanings |= {"singularity_distance": "distance to the law's singularity, divided by its unit [-]",
                            "singularity_distance_unit": "unit of singularity_distance"}  # fmt: skip
-
-    reads = ("t", "tracking", "out.d_hat", *(f"before.{name}" for name in memories), *computer.signal_names("now"),
-             *(("dt",) if filter_parts else ()),
-             *(("before.singularity_distance_unit", "last.command", "last.s") if can_be_singular else ()))  # fmt: skip
 
     def command(parameters: Values, values: Values) -> Values:
         law, period, t = parameters["law"], parameters["period"], values["t"]
@@ -461,7 +445,7 @@ def _add_law_stage(computer: Board, law: Law, observer: Observer, command_filter
         return {"out.command": u, "out.s": s} | {f"now.{name}": value for name, value in memory_after.items()}
 
     summary = f"Control law: the command for the measured state{filter_note}; the last command if the law is singular."
-    computer.stages.append(Stage("command", summary, reads, command, (law, law.kinematics, *filter_parts)))
+    computer.stages.append(Stage("command", summary, command, (law, law.kinematics, *filter_parts)))
 
 
 def begin(parameters: Values, values: Values) -> Values:
@@ -476,15 +460,13 @@ def begin(parameters: Values, values: Values) -> Values:
 
 def _add_actuator_stage(computer: Board, device: Actuators, m: int) -> None:
     """Add a stage that models the actuators: delay, limits, allocation to wheels."""
-    wheels, reads = device.wheels, ["out.command"]
+    wheels = device.wheels
     if device.delay:
         computer.state["queue"] = real(device.delay, m)
         computer.meanings["queue"] = "delayed commands, the oldest first [N m]"
-        reads.append("before.queue")
     if device.has_dynamics:
         computer.inputs.setdefault("acting", real(m))
         computer.meanings["acting"] = "torque of each axis or wheel at this sample, from telemetry [N m]"
-        reads.append("in.acting")
     compensation_note = "" if wheels is None else ", plus the compensation of the wheels' momentum"
     computer.outputs |= {"sent_torque": real(m), "torque": real(m)}
     computer.meanings["sent_torque"] = (
@@ -494,7 +476,6 @@ def _add_actuator_stage(computer: Board, device: Actuators, m: int) -> None:
     if wheels is not None:
         computer.outputs["wheel_torque"] = real(*np.shape(wheels.initial))
         computer.meanings["wheel_torque"] = "torque of each wheel on the body about its axis, from this sample on [N m]"
-        reads += ["in.wheel_momentum", "now.rate"]
 
     def act(parameters: Values, values: Values) -> Values:
         actuators, u = parameters["actuators"], values["out.command"]
@@ -507,5 +488,4 @@ def _add_actuator_stage(computer: Board, device: Actuators, m: int) -> None:
             return {**results, "out.torque": drive.c}
         return {**results, "out.torque": actuators.wheels.axes @ drive.c, "out.wheel_torque": drive.c}
 
-    summary = "Actuators: limits, delay, allocation to wheels."
-    computer.stages.append(Stage("act", summary, tuple(reads), act, (device,)))
+    computer.stages.append(Stage("act", "Actuators: limits, delay, allocation to wheels.", act, (device,)))

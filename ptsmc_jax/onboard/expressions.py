@@ -169,8 +169,8 @@ class Pool:
         simplified = self._simplify(op, args, kind)
         if simplified is not None:
             return simplified
-        ordered = tuple(sorted(args, key=id)) if op in ("add", "mul", "and", "or", "eq", "ne") else args
-        key = (op, kind, value, *map(id, ordered))
+        ordered = sorted(args, key=lambda node: node.serial) if op in ("add", "mul", "and", "or", "eq", "ne") else args
+        key = (op, kind, value, *ordered)
         existing = self.block.find(key)
         if existing is not None:
             return existing

@@ -146,7 +146,7 @@ class Parameters:
 
     def mark_used(self, printer: Printer) -> None:
         """Mark the fields that a function reads."""
-        read_names = {node.value.partition("[")[0] for node in printer.nodes.values() if node.op == "place"}
+        read_names = {node.value.partition("[")[0] for node in printer.use_counts if node.op == "place"}
         self.used |= {
             member.name for member in self.fields if f"{self.struct_pointer(member)}->{member.name}" in read_names
         }

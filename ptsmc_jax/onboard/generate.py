@@ -120,18 +120,17 @@ def _add_stage_function(code: Code, board: Board, stage: Stage, structs: dict[st
         prefix, _, key = name.partition(".")
         return structs[STRUCTS[prefix]][key]
 
-    def shape_of(name: str) -> Any:
-        prefix, _, key = name.partition(".")
-        return SCALARS[name]() if name in SCALARS else getattr(board, STRUCTS[prefix])[key]
+    shapes = {name: shape() for name, shape in SCALARS.items()}
+    shapes |= {f"{prefix}.{key}": shape for prefix, struct in STRUCTS.items()
+               for key, shape in getattr(board, struct).items()}  # fmt: skip
 
-    def run_stage(parameter_leaves: list[Any], read_values: list[Any]) -> dict[str, Any]:
-        """Return the values that the stage writes, by name, given the values of the names in `stage.reads`."""
-        return stage.run(params.unflatten(parameter_leaves), dict(zip(stage.reads, read_values, strict=True)))
+    def run_stage(parameter_leaves: list[Any], values: list[Any]) -> dict[str, Any]:
+        """Return the values that the stage writes, by name, given all values in the order of `shapes`."""
+        return stage.run(params.unflatten(parameter_leaves), dict(zip(shapes, values, strict=True)))
 
     pool, args = Pool(), list[np.ndarray]()
-    shapes = [shape_of(name) for name in stage.reads]
-    jaxpr, written = jax.make_jaxpr(run_stage, return_shape=True)(params.leaves, shapes)
-    for name, shape in zip(stage.reads, shapes, strict=True):
+    jaxpr, written = jax.make_jaxpr(run_stage, return_shape=True)(params.leaves, list(shapes.values()))
+    for name, shape in shapes.items():
         if name in SCALARS:
             args.append(object_array((), [pool.place(name, kind_of(shape.dtype))]))
         else:
@@ -151,7 +150,7 @@ def _add_stage_function(code: Code, board: Board, stage: Stage, structs: dict[st
             assignments += zip(locations, result.flat, strict=True)
     printer = printing.Printer(SCALAR_PARAMETERS)
     body = printer.body(pool.block, assignments, returned=return_value)
-    needed_arguments |= {node.value.partition("->")[0] for node in printer.nodes.values() if node.op == "place"}
+    needed_arguments |= {node.value.partition("->")[0] for node in printer.use_counts if node.op == "place"}
     params.mark_used(printer)
     arguments = {name: text for name, text in (POINTERS | SCALAR_PARAMETERS).items() if name in needed_arguments}
     kind = "void" if return_value is None else "int"

@@ -70,9 +70,9 @@ def plant_board(parts: Parts, dispersion: Dispersion, controller: Board) -> Boar
     computer.meanings["true_disturbance"] = f"disturbance at this sample{controller.unit}"
     computer.meanings |= {f"true_{name}": f"{text}, without errors" for name, text in parts.plant.signals.items()}
     computer.stages = [
-        Stage("begin", "The plant at the first sample: dispersions, sensors, first readings.", (), begin),
+        Stage("begin", "The plant at the first sample: dispersions, sensors, first readings.", begin),
         Stage("advance", "One control period: actuators, disturbance, motion, then the readings at the next sample.",
-              ("in." + command, "before.plant", "before.sample", "before.keys"), advance, (parts.plant,)),
+              advance, (parts.plant,)),
     ]  # fmt: skip
     return computer
 

@@ -10,7 +10,7 @@ from string import Template
 from typing import Any
 
 from ptsmc_jax.numerics import guards
-from ptsmc_jax.onboard.expressions import BOOL, REAL, Block, Node, Region
+from ptsmc_jax.onboard.expressions import BOOL, REAL, Block, Node, Region, Title
 
 FILES = Path(__file__).parent / "files"
 WIDTH = 110  # characters of a line
@@ -31,7 +31,7 @@ INFIX = {"add": ("+", 12), "sub": ("-", 12), "mul": ("*", 13), "div": ("/", 13),
          "le": ("<=", 10), "gt": (">", 10), "ge": (">=", 10), "eq": ("==", 9), "ne": ("!=", 9), "and": ("&&", 5),
          "or": ("||", 4)}  # fmt: skip
 HELPER_NAMES = {"max": "larger", "min": "smaller", "sign": "sign_of"}  # helper functions in C, by operation
-HELPER_OPERATIONS = ("threefry", "erf_inv")  # further helper functions in C, with the names of their operations
+C_FUNCTIONS = ("threefry", "erf_inv", "isfinite")  # operations with the names of their functions in C
 # integer types: the least and the largest integer in C, and the smallest real number that is too large for the type
 INTEGER_TYPES = {"int32_t": ("INT32_MIN", "INT32_MAX", "2147483648"),
                  "int64_t": ("INT64_MIN", "INT64_MAX", "9223372036854775808.0"),
@@ -84,13 +84,12 @@ class Printer:
     """Prints the statements of one C function."""
 
     def __init__(self, taken_names: Iterable[str] = ()):
-        self.names: dict[int, str] = {}  # C names of the variables, by id of the node
-        self.bases: dict[int, str] = {}  # first parts of these names, by id of the `Title`
+        self.names: dict[Node, str] = {}  # C names of the variables
+        self.bases: dict[Title, str] = {}  # first parts of these names
         self.taken_names = RESERVED | set(taken_names)
-        self.use_counts: Counter[int] = Counter()
-        self.nodes: dict[int, Node] = {}
-        self.with_variable: set[int] = set()
-        self.lengths: dict[int, int] = {}  # approximate length of the text of each expression
+        self.use_counts: Counter[Node] = Counter()  # number of uses of each node that is needed
+        self.with_variable: set[Node] = set()
+        self.lengths: dict[Node, int] = {}  # approximate length of the text of each expression
         self.counts: Counter[str] = Counter()
         self.section: Any = None
         self.count = 0
@@ -110,13 +109,13 @@ class Printer:
             outputs: memory locations to assign, and their values.
             returned: value of the return statement, or None without one.
         """
-        for node in [*(node for _, node in outputs), *([] if returned is None else [returned])]:
-            self._count_use(node)
-        for node in sorted(self.nodes.values(), key=lambda node: node.serial):
-            self.lengths[id(node)] = 8 if node.op in ATOMS else 3 + sum(self.lengths[id(arg)] for arg in node.args)
-            if self._needs_variable(node):
-                self.with_variable.add(id(node))
-                self.lengths[id(node)] = 8
+        self._count_use(*(node for _, node in outputs), *([] if returned is None else [returned]))
+        for node in sorted(self.use_counts, key=lambda node: node.serial):
+            self.lengths[node] = 8 if node.op in ATOMS else 3 + sum(self.lengths[arg] for arg in node.args)
+            is_inline = node.title is None and self.use_counts[node] == 1 and self.lengths[node] <= MAX_INLINE_LENGTH
+            if not is_inline and node.op not in (*ATOMS, "region"):
+                self.with_variable.add(node)
+                self.lengths[node] = 8
         indent = "    "
         lines = self._print_block(block, indent)
         if outputs and self.section is not None:
@@ -124,51 +123,37 @@ class Printer:
         lines += [line for place, node in outputs for line in wrap_statement(f"{place} = {self.text(node)};", indent)]
         return lines if returned is None else [*lines, *wrap_statement(f"return {self.text(returned)};", indent)]
 
-    # nodes that are needed, and nodes that get a variable
-
-    def _count_use(self, node: Node) -> None:
-        is_new = id(node) not in self.nodes
-        self.use_counts[id(node)] += 1
-        self.nodes[id(node)] = node
-        if not is_new:
-            return
-        for arg in node.args:
-            self._count_use(arg)
-        if node.op == "region":
-            self._count_region_uses(node.value)
+    def _count_use(self, *nodes: Node) -> None:
+        """Count a use of nodes. The first use of a node is a use of its operands."""
+        for node in nodes:
+            self.use_counts[node] += 1
+            if self.use_counts[node] == 1:
+                self._count_use(*node.args)
+                if node.op == "region":
+                    self._count_region_uses(node.value)
 
     def _count_region_uses(self, region: Region) -> None:
-        if region.test is not None:
-            self._count_use(region.test)
-        for node in (*region.initial, *(entry for _, entries in region.tables for entry in entries)):
-            self._count_use(node)
-        for outputs in region.outputs:
-            for node in outputs:
-                self._count_use(node)
+        self._count_use(*([] if region.test is None else [region.test]), *region.initial)
+        for nodes in (*(entries for _, entries in region.tables), *region.outputs):
+            self._count_use(*nodes)
         if region.kind != "branch":  # the inputs of a loop are computed before it
-            block_ids = {id(block) for block in region.blocks}
-            for node in list(self.nodes.values()):
+            for node in list(self.use_counts):
                 for arg in node.args:
-                    if id(node.block) in block_ids and id(arg.block) not in block_ids:
-                        self.use_counts[id(arg)] += 1
-
-    def _needs_variable(self, node: Node) -> bool:
-        if node.op in ATOMS or node.op == "region":
-            return False
-        return node.title is not None or self.use_counts[id(node)] > 1 or self.lengths[id(node)] > MAX_INLINE_LENGTH
+                    if node.block in region.blocks and arg.block not in region.blocks:
+                        self.use_counts[arg] += 1
 
     # statements
 
     def _print_block(self, block: Block, indent: str) -> list[str]:
         lines: list[str] = []
         for node in block.nodes:
-            if id(node) not in self.nodes:
+            if node not in self.use_counts:
                 continue
             if node.op == "region":
                 lines += self._section_heading(node, indent)
                 statement = self._print_branch if node.value.kind == "branch" else self._print_loop
                 lines += statement(node.value, indent)
-            elif id(node) in self.with_variable:
+            elif node in self.with_variable:
                 lines += self._section_heading(node, indent)
                 text = self.text(node, inside=True)
                 lines += wrap_statement(f"const {c_type(node.kind)} {self._variable_name(node)} = {text};", indent)
@@ -183,27 +168,26 @@ class Printer:
         return ["", *format_comment(title, indent)]
 
     def _print_branch(self, region: Region, indent: str) -> list[str]:
-        is_used = [id(node) in self.nodes for node in region.results]
-        results = [node for node, used in zip(region.results, is_used, strict=True) if used]
-        lines = [f"{indent}{c_type(node.kind)} {self._variable_name(node)};" for node in results]
+        results = [(k, node) for k, node in enumerate(region.results) if node in self.use_counts]
+        lines = [f"{indent}{c_type(node.kind)} {self._variable_name(node)};" for _, node in results]
         assert region.test is not None
         lines += wrap_statement(f"if ({self.text(region.test)}) {{", indent)
-        for k, (block, outputs) in enumerate(zip(region.blocks, region.outputs, strict=True)):
-            if k:
-                lines.append(f"{indent}}} else {{")
+        for block, outputs in zip(region.blocks, region.outputs, strict=True):
             outer = self.section
             lines += self._print_block(block, indent + "    ")
-            for node, output, used in zip(region.results, outputs, is_used, strict=True):
-                if used:
-                    lines += wrap_statement(f"{self._variable_name(node)} = {self.text(output)};", indent + "    ")
-            self.section = outer if k == 0 else None
+            for k, node in results:
+                lines += wrap_statement(f"{self._variable_name(node)} = {self.text(outputs[k])};", indent + "    ")
+            if block is region.blocks[0]:
+                lines.append(f"{indent}}} else {{")
+                self.section = outer
+        self.section = None
         return [*lines, f"{indent}}}"]
 
     def _print_loop(self, region: Region, indent: str) -> list[str]:
         inner, lines = indent + "    ", []
         for node, start, result in zip(region.carried, region.initial, region.results, strict=True):
             node.title, node.indices = result.title, result.indices
-            self.names[id(result)] = self._variable_name(node)
+            self.names[result] = self._variable_name(node)
             lines += wrap_statement(f"{c_type(node.kind)} {self._variable_name(node)} = {self.text(start)};", indent)
         self.table_entries += sum(len(entries) for _, entries in region.tables) + len(region.rows) * region.length
         for table, entries in region.tables:
@@ -243,24 +227,21 @@ class Printer:
     # names
 
     def _variable_name(self, node: Node) -> str:
-        if id(node) not in self.names:
+        if node not in self.names:
             if node.title is None:
                 prefix = {"index": "k", "table": "table"}.get(node.op, "a")
                 self.count += 1
-                self.names[id(node)] = self._unused_name(f"{prefix}{self.count}")
+                self.names[node] = self._unused_name(f"{prefix}{self.count}")
             else:
-                base = self._base_name(node)
-                name = f"{base}_{node.indices}" if node.indices else base
-                self.names[id(node)] = self._unused_name(name, allowed=base)
-        return self.names[id(node)]
+                base = self._base_name(node.title)
+                self.names[node] = self._unused_name(f"{base}_{node.indices}" if node.indices else base, allowed=base)
+        return self.names[node]
 
-    def _base_name(self, node: Node) -> str:
-        assert node.title is not None
-        if id(node.title) not in self.bases:
-            plain = re.sub(r"\W", "_", node.title.name).strip("_") or "x"
-            plain = f"{plain}_" if plain in RESERVED or plain[0].isdigit() else plain
-            self.bases[id(node.title)] = self._unused_name(plain)
-        return self.bases[id(node.title)]
+    def _base_name(self, title: Title) -> str:
+        if title not in self.bases:
+            plain = re.sub(r"\W", "_", title.name).strip("_") or "x"
+            self.bases[title] = self._unused_name(f"{plain}_" if plain in RESERVED or plain[0].isdigit() else plain)
+        return self.bases[title]
 
     def _unused_name(self, name: str, allowed: str = "") -> str:
         candidate, k = name, ord("b")
@@ -282,10 +263,10 @@ class Printer:
             return "resolution()" if is_resolution else format_constant(node.value, node.kind), ATOM
         if node.op == "place":
             return node.value, ATOM
-        if node.op in ATOMS or (id(node) in self.with_variable and not inside):
+        if node.op in ATOMS or (node in self.with_variable and not inside):
             return self._variable_name(node), ATOM
         self.counts[node.op] += 1
-        if node.op == "add" and node.args[1].op == "neg" and id(node.args[1]) not in self.with_variable:
+        if node.op == "add" and node.args[1].op == "neg" and node.args[1] not in self.with_variable:
             return self._infix("-", 12, node.args[0], node.args[1].args[0])
         if node.op in INFIX:
             return self._infix(*INFIX[node.op], *node.args)
@@ -308,12 +289,10 @@ class Printer:
         arguments = ", ".join(self.text(arg) for arg in node.args)
         if node.op in HELPER_NAMES:
             return f"{HELPER_NAMES[node.op]}{_suffix(node.kind)}({arguments})", ATOM
-        if node.op in HELPER_OPERATIONS:
+        if node.op in C_FUNCTIONS:
             return f"{node.op}({arguments})", ATOM
         if node.op == "abs" and node.kind != REAL:
             return f"larger{_suffix(node.kind)}({arguments}, -{self._in_parentheses(node.args[0], UNARY + 1)})", ATOM
-        if node.op == "isfinite":
-            return f"isfinite({arguments})", ATOM
         return f"M({'fabs' if node.op == 'abs' else node.op})({arguments})", ATOM
 
     def _infix(self, sign: str, precedence: int, a: Node, b: Node) -> tuple[str, int]:

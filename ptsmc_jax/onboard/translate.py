@@ -262,20 +262,15 @@ class Translator:
         self, eqn: Any, array: np.ndarray, indices: np.ndarray, addends: np.ndarray, index: Node | None, k: int
     ) -> np.ndarray:
         """Return an array with additions or subtractions at indices, if the computed index `index` is k."""
-        numbers, types = _constant_values(indices, index, k), [variable.aval.dtype for variable in eqn.invars]
-        total = array.copy()
-        for position in np.ndindex(*addends.shape):  # find the entries that each number is added to
-            unit_addend = np.zeros(addends.shape)
-            unit_addend[position] = 1.0
-            with jax.ensure_compile_time_eval():
-                arrays = [
-                    jnp.asarray(v, dtype)
-                    for v, dtype in zip((np.zeros(array.shape), numbers, unit_addend), types, strict=True)
-                ]
-                is_changed = np.asarray(components.bind(eqn, arrays)[0])
-            for entry in map(tuple, np.argwhere(is_changed)):
-                operands: Any = total[entry], addends[position]
-                total[entry] = self.pool.make(_INDEXED_ADDITIONS[eqn.primitive.name], *operands, kind=kind_of(types[0]))
+        units = np.eye(addends.size).reshape(-1, *addends.shape)
+        values = np.zeros(array.shape), _constant_values(indices, index, k), units
+        with jax.ensure_compile_time_eval():
+            operands = [jnp.asarray(v, variable.aval.dtype) for v, variable in zip(values, eqn.invars, strict=True)]
+            add_unit = jax.vmap(lambda unit: components.bind(eqn, [*operands[:2], unit])[0])
+            is_changed = np.asarray(add_unit(operands[2]))  # by each number, (numbers, *array.shape)
+        total, op, kind = array.copy(), _INDEXED_ADDITIONS[eqn.primitive.name], kind_of(eqn.outvars[0].aval.dtype)
+        for number, *entry in np.argwhere(is_changed):
+            total[tuple(entry)] = self.pool.make(op, total[tuple(entry)], addends.flat[number], kind=kind)
         return total
 
 

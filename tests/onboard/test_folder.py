@@ -337,8 +337,8 @@ def test_command_filter_advances_by_one_period_after_missed_samples():
     def commanded(simulated, gap):
         made = build_board(simulated)
         (stage,) = (one for one in made.stages if one.name == "command")
-        read = {name: jax.tree.map(jnp.asarray, (known | {"dt": gap})[name]) for name in stage.reads}
-        return np.asarray(stage.run(made.parameters, read)["out.command"])
+        values = jax.tree.map(jnp.asarray, known | {"dt": gap})
+        return np.asarray(stage.run(made.parameters, values)["out.command"])
 
     period = float(parts.period)
     g = np.tan(0.5 * float(parts.command_filter.corner) * period)
