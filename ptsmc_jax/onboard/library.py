@@ -8,7 +8,6 @@ import itertools
 import json
 import os
 import re
-import shlex
 import shutil
 import subprocess
 import tempfile
@@ -39,17 +38,12 @@ _loaded = itertools.count()  # number of the next library, for unique names in X
 
 def compiler() -> list[str]:
     """Return the command of the C compiler. Raises ScenarioError if there is none."""
-    command = os.environ.get("CC", "")
-    try:
-        configured = shlex.split(command)
-    except ValueError as error:
-        raise ScenarioError(f"CC is {command}, but must be a command: {error}") from None
-    chosen = configured or [name for name in ("cc", "gcc", "clang") if shutil.which(name)][:1]
-    if not chosen or shutil.which(chosen[0]) is None:
-        raise ScenarioError(
-            f"there is no C compiler{f' {command}' if command else ''}; install cc, gcc or clang, or set CC to one"
-        )
-    return chosen
+    configured = os.environ.get("CC", "").split()
+    for command in [configured] if configured else (["cc"], ["gcc"], ["clang"]):
+        if shutil.which(command[0]):
+            return command
+    name = "".join(f" {part}" for part in configured)
+    raise ScenarioError(f"there is no C compiler{name}; install cc, gcc or clang, or set CC to one")
 
 
 def compile_library(*arguments: str, folder: Path | None = None) -> str:
@@ -94,7 +88,7 @@ class Library:
             except (OSError, AttributeError) as error:  # built for another processor or language, or without a function
                 reason = str(error).removeprefix(f"{library}: ")
                 raise ScenarioError(
-                    f"the controller in {self.folder} does not load after {shlex.join(compiler())} has compiled it: "
+                    f"the controller in {self.folder} does not load after {' '.join(compiler())} has compiled it: "
                     f"{reason}; use a C compiler for this machine, and put or #include all code in "
                     f"ptsmc_{self.name}.c and ptsmc_{self.name}_parameters.c"
                 ) from None

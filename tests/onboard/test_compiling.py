@@ -100,11 +100,10 @@ def test_cc_may_have_options_and_must_compile_for_this_machine(chain, monkeypatc
     shutil.copytree(chain, "-c")
     monkeypatch.setenv("CC", f"{CC} -pedantic -Wall -Wextra -Werror")
     Library("-c")
-    for cc, said in (("true", "does not load after true has compiled it: .* use a C compiler for this machine"),
-                     ("'cc", "^CC is 'cc, but must be a command: No closing quotation$")):  # fmt: skip
-        monkeypatch.setenv("CC", cc)
-        with pytest.raises(ScenarioError, match=said):
-            Library("-c")
+    monkeypatch.setenv("CC", "true")
+    said = "does not load after true has compiled it: .* use a C compiler for this machine"
+    with pytest.raises(ScenarioError, match=said):
+        Library("-c")
 
 
 @needs_compiler
