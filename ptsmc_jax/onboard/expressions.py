@@ -203,26 +203,17 @@ class Pool:
         return None
 
     def _simplify_arithmetic(self, op: str, a: Node, b: Node, kind: str) -> Node | None:
-        def is_constant(node: Node, value: float) -> bool:
-            return node.op == "constant" and node.value == value
-
-        if op == "add" and (is_constant(a, 0) or is_constant(b, 0)):
-            return b if is_constant(a, 0) else a
-        if op == "sub":
-            if is_constant(b, 0):
-                return a
-            if is_constant(a, 0):
-                return self.make("neg", b, kind=kind)
+        """Return a simpler node that equals an operation of two numbers, one of which is constant, or None."""
+        constant, other = (a, b) if a.op == "constant" else (b, a)
+        value = constant.value
         if op == "mul":
-            factor, other = (a, b) if a.op == "constant" else (b, a)
-            if is_constant(factor, 0.5) and other.op == "add" and other.args[0] is other.args[1]:
+            if value == 0.5 and other.op == "add" and other.args[0] is other.args[1]:
                 return other.args[0]  # half of a + a is exactly a
-            if (is_constant(a, 0) and b.finite) or (is_constant(b, 0) and a.finite):
+            if value == 0 and other.finite:
                 return self.constant(0, kind)
-            if is_constant(a, 1) or is_constant(b, 1):
-                return b if is_constant(a, 1) else a
-            if is_constant(a, -1) or is_constant(b, -1):
-                return self.make("neg", b if is_constant(a, -1) else a, kind=kind)
-        if op == "div" and is_constant(b, 1):
-            return a
-        return None
+            if value == -1:
+                return self.make("neg", other, kind=kind)
+        if op == "sub" and value == 0 and constant is a:
+            return self.make("neg", b, kind=kind)
+        neutral = {"add": 0, "sub": 0, "mul": 1, "div": 1}[op]
+        return other if value == neutral and (op in ("add", "mul") or constant is b) else None

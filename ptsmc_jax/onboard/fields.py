@@ -127,10 +127,6 @@ class Parameters:
     rules: list[Rule] = field(default_factory=list)  # rules that C can evaluate
     used: set[str] = field(default_factory=set)  # names that C reads
 
-    def unflatten(self, leaves: Any) -> Any:
-        """Return the parameters with these leaves."""
-        return jax.tree.unflatten(self.structure, leaves)
-
     def struct_pointer(self, member: Field) -> str:
         """Return the name of the pointer to the struct that contains a field."""
         return "d" if member.name in self.derived else "p"
@@ -165,7 +161,7 @@ class Parameters:
         """Return the jaxpr that applies rules to the leaves."""
 
         def apply_rules(leaves: list[Any]) -> list[Any]:
-            values = self.unflatten(leaves)
+            values = jax.tree.unflatten(self.structure, leaves)
             for rule in rules:
                 values = rule(values)
             return jax.tree.leaves(values)

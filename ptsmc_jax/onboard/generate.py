@@ -126,7 +126,8 @@ def _add_stage_function(code: Code, board: Board, stage: Stage, structs: dict[st
 
     def run_stage(parameter_leaves: list[Any], values: list[Any]) -> dict[str, Any]:
         """Return the values that the stage writes, by name, given all values in the order of `shapes`."""
-        return stage.run(params.unflatten(parameter_leaves), dict(zip(shapes, values, strict=True)))
+        parameters = jax.tree.unflatten(params.structure, parameter_leaves)
+        return stage.run(parameters, dict(zip(shapes, values, strict=True)))
 
     pool, args = Pool(), list[np.ndarray]()
     jaxpr, written = jax.make_jaxpr(run_stage, return_shape=True)(params.leaves, list(shapes.values()))

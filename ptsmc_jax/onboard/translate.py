@@ -6,6 +6,7 @@ error.
 """
 
 import functools
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -14,11 +15,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend import core
 
 from ptsmc_jax.batching import components
 from ptsmc_jax.batching.components import object_array
-from ptsmc_jax.batching.dependence import called_jaxpr, open_jaxpr
+from ptsmc_jax.batching.dependence import called_jaxpr, interpret, open_jaxpr
 from ptsmc_jax.batching.lapack import NEVER_BATCHED, SIZE_LIMITED
 from ptsmc_jax.numerics import draws, elementary
 from ptsmc_jax.onboard import origins
@@ -67,22 +67,23 @@ class Translator:
     def evaluate(self, closed: Any, args: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Return the components of a jaxpr's outputs, given the components of its inputs."""
         jaxpr, consts = open_jaxpr(closed)
-        components_of: dict[Any, np.ndarray] = dict(zip(jaxpr.constvars, map(self.constant, consts), strict=True))
-        components_of |= dict(zip(jaxpr.invars, args, strict=True))
-        spans = [() if self.outer_frames else tuple(origins.stack_frames(eqn)[:1]) for eqn in jaxpr.eqns]
-        for k, eqn in enumerate(jaxpr.eqns):
-            values = [self.constant(v.val) if isinstance(v, core.Literal) else components_of[v] for v in eqn.invars]
-            frames = self.outer_frames or origins.stack_frames(eqn)
+        all_frames = [self.outer_frames or origins.stack_frames(eqn) for eqn in jaxpr.eqns]
+        # the last equation of an expression of the source has the value of the expression
+        is_last = [frames[:1] != following[:1] for frames, following in itertools.pairwise([*all_frames, []])]
+        frames_in_order = zip(all_frames, is_last, strict=True)
+
+        def translate(eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
+            frames, has_value = next(frames_in_order)
             outer, self.pool.section = self.pool.section, origins.find_section(frames) or self.pool.section
             results = self.translate_equation(eqn, values, frames)
             self.pool.section = outer
-            if self.outer_frames is None and (k + 1 == len(spans) or spans[k + 1] != spans[k]) and len(results) == 1:
+            if self.outer_frames is None and has_value and len(results) == 1:
                 name = origins.value_name(frames)
                 if name not in ("", "_"):
                     name_nodes(results[0], name)
-            for variable, result in zip(eqn.outvars, results, strict=True):
-                components_of[variable] = result
-        return [self.constant(v.val) if isinstance(v, core.Literal) else components_of[v] for v in jaxpr.outvars]
+            return results
+
+        return interpret(jaxpr, consts, args, self.constant, translate)
 
     def translate_equation(self, eqn: Any, values: list[np.ndarray], frames: list[origins.Frame]) -> list[np.ndarray]:
         """Return the components of one equation's outputs.
@@ -270,7 +271,8 @@ class Translator:
             is_changed = np.asarray(add_unit(operands[2]))  # by each number, (numbers, *array.shape)
         total, op, kind = array.copy(), _INDEXED_ADDITIONS[eqn.primitive.name], kind_of(eqn.outvars[0].aval.dtype)
         for number, *entry in np.argwhere(is_changed):
-            total[tuple(entry)] = self.pool.make(op, total[tuple(entry)], addends.flat[number], kind=kind)
+            pair: Any = total[tuple(entry)], addends.flat[number]
+            total[tuple(entry)] = self.pool.make(op, *pair, kind=kind)
         return total
 
 
