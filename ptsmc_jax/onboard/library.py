@@ -79,19 +79,7 @@ class Library:
                 raise invalid
         except (OSError, ValueError, OverflowError, KeyError, TypeError):
             raise invalid from None
-        # the library stays loaded after its file has been deleted
-        with tempfile.TemporaryDirectory(prefix="ptsmc-") as build_folder:
-            library = self._compile(Path(build_folder), real, options)
-            try:
-                self.binary = ctypes.CDLL(str(library))
-                self.binary.ptsmc_set()
-            except (OSError, AttributeError) as error:  # built for another processor or language, or without a function
-                reason = str(error).removeprefix(f"{library}: ")
-                raise ScenarioError(
-                    f"the controller in {self.folder} does not load after {' '.join(compiler())} has compiled it: "
-                    f"{reason}; use a C compiler for this machine, and put or #include all code in "
-                    f"ptsmc_{self.name}.c and ptsmc_{self.name}_parameters.c"
-                ) from None
+        self.binary = self._load(real, options)
         # other sizes: the C belongs to another controller.json
         if sizes != list((ctypes.c_long * 4).in_dll(self.binary, "ptsmc_sizes")):
             raise invalid
@@ -100,18 +88,30 @@ class Library:
         self.target = f"ptsmc_{self.name}_{self.checksum}_{real}_{next(_loaded)}"  # name of the C function in XLA
         jax.ffi.register_ffi_target(self.target, jax.ffi.pycapsule(self.binary.ptsmc_called), platform="cpu")
 
-    def _compile(self, folder: Path, real: str, options: tuple[str, ...]) -> Path:
-        glue, library = folder / "glue.c", folder / "controller.so"
-        glue.write_text(with_public_prefix(fill_template("in_the_loop.c", name=self.name), self.name), encoding="utf-8")
-        copied = folder / "controller"  # a copy of only those files that campaigns store and check
-        sources.copy(self.folder, copied)
-        files = [str(copied / f"ptsmc_{self.name}{end}.c") for end in ("", "_parameters")]
-        # XLA's headers are system headers, so that compilers warn of our code only
-        flags = "-isystem", jax.ffi.include_dir(), *options, f"-DPTSMC_REAL={real}", f"-I{copied}"
-        error = compile_library(*flags, *files, str(glue), "-o", str(library)).replace(str(copied), str(self.folder))
-        if error:
-            raise ScenarioError(f"the *.c and *.h files of the controller in {self.folder} do not compile: {error}")
-        return library
+    def _load(self, real: str, options: tuple[str, ...]) -> ctypes.CDLL:
+        """Compile and load the C. The library stays loaded after its file has been deleted."""
+        with tempfile.TemporaryDirectory(prefix="ptsmc-") as build_folder:
+            glue, library, copied = (Path(build_folder) / name for name in ("glue.c", "controller.so", "controller"))
+            glue.write_text(with_public_prefix(fill_template("in_the_loop.c", name=self.name), self.name), "utf-8")
+            sources.copy(self.folder, copied)  # only those files that campaigns store and check
+            files = [str(copied / f"ptsmc_{self.name}{end}.c") for end in ("", "_parameters")]
+            # XLA's headers are system headers, so that compilers warn of our code only
+            flags = "-isystem", jax.ffi.include_dir(), *options, f"-DPTSMC_REAL={real}", f"-I{copied}"
+            error = compile_library(*flags, *files, str(glue), "-o", str(library))
+            if error:
+                error = error.replace(str(copied), str(self.folder))
+                raise ScenarioError(f"the *.c and *.h files of the controller in {self.folder} do not compile: {error}")
+            try:
+                binary = ctypes.CDLL(str(library))
+                binary.ptsmc_set()
+            except (OSError, AttributeError) as error:  # built for another processor or language, or without a function
+                reason = str(error).removeprefix(f"{library}: ")
+                raise ScenarioError(
+                    f"the controller in {self.folder} does not load after {' '.join(compiler())} has compiled it: "
+                    f"{reason}; use a C compiler for this machine, and put or #include all code in "
+                    f"ptsmc_{self.name}.c and ptsmc_{self.name}_parameters.c"
+                ) from None
+        return binary
 
     def initial_state(self) -> np.ndarray:
         """Return the state after `ptsmc_init`."""
