@@ -281,7 +281,7 @@ def _parameter_makers(
         table: Any = getattr(prior, name, None)
         if not hasattr(table, "widths"):  # no dispersion is given, or a phase is uniform over the circle
             return np.full(count, default_sigma["noise" if name.endswith("_noise") else name]), False
-        sigmas = table.widths(count) * (1.0 if table.name.endswith("normal") else 1.0 / np.sqrt(3.0))
+        sigmas = table.widths(count) * (1.0 if table.kind.endswith("normal") else 1.0 / np.sqrt(3.0))
         return np.maximum(sigmas, 1e-9), True
 
     def parameter_maker(

@@ -4,7 +4,6 @@
 """
 
 import dataclasses
-import typing
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -25,9 +24,8 @@ BelowOne = Annotated[float, Meta(ge=0, lt=1, description="a number from 0 to bel
 
 
 class Numbers(Table, frozen=True):
-    """Random numbers about the nominal values of a scenario."""
+    """Normal random numbers about the nominal values of a scenario, or other ones in derived tables."""
 
-    name: ClassVar[str] = "normal"  # name of the kind in scenario files
     distribution: ClassVar[str] = "normal"  # distribution of `dispersions.numbers.RandomNumbers`
     width_key: ClassVar[str] = "std"  # the key that holds the spread; it is in degrees if its name ends with _deg
     norm_quantile: ClassVar[float] = 4.6  # norm / spread that 1 of 10 000 vectors (3,) exceeds
@@ -46,6 +44,11 @@ class Numbers(Table, frozen=True):
         """Whether the spread is zero."""
         return not np.any(self.widths())
 
+    @property
+    def largest(self) -> float:
+        """The largest deviation from the nominal value that bounds assume."""
+        return self.largest_deviation * float(self.widths()[0])
+
     def build(self, parts: Any, count: int) -> Any:
         """Return `dispersions.numbers.RandomNumbers`, (count,)."""
         return RandomNumbers(self.distribution, vector(self.widths(count)))
@@ -54,98 +57,97 @@ class Numbers(Table, frozen=True):
 class Uniform(Numbers, frozen=True):
     """Uniform random numbers, symmetric about the nominal value."""
 
-    name: ClassVar[str] = "uniform"
     distribution: ClassVar[str] = "uniform"
     width_key: ClassVar[str] = "half_width"
     norm_quantile: ClassVar[float] = float(np.sqrt(3.0))
     largest_deviation: ClassVar[float] = 1.0
 
 
-class Relative(Numbers, frozen=True):
-    """Factors 1 + a normal number, truncated at three sigma."""
+RATE, BIAS = Scaled(0.01, time=-1), Scaled(1e-3, inertia=1, order=-1)
+BIAS_TEXT = "of each component; default: 1e-3, scaled to the mission"
 
-    name: ClassVar[str] = "relative_normal"
+
+class NormalRate(Numbers, frozen=True):
+    """Each axis normal about initial.rate."""
+
+    kind: Literal["normal"] = "normal"
+    std: Annotated[
+        NotNegative | None, Meaning("1 sigma per axis; default: 0.01, scaled to the mission", "rad/s")
+    ] = None  # fmt: skip
+    scaled: ClassVar[Mapping[str, Scaled]] = {"std": RATE}
+
+
+class UniformRate(Uniform, frozen=True):
+    """Each axis uniform about initial.rate."""
+
+    kind: Literal["uniform"] = "uniform"
+    half_width: Annotated[
+        NotNegative | None, Meaning("largest deviation per axis; default: 0.01, scaled to the mission", "rad/s")
+    ] = None
+    scaled: ClassVar[Mapping[str, Scaled]] = {"half_width": RATE}
+
+
+class NormalBias(Numbers, frozen=True):
+    """Normal about the value in [disturbance]."""
+
+    kind: Literal["normal"] = "normal"
+    std: Annotated[NotNegative | None, Meaning("1 sigma " + BIAS_TEXT, "unit of d")] = None
+    scaled: ClassVar[Mapping[str, Scaled]] = {"std": BIAS}
+
+
+class UniformBias(Uniform, frozen=True):
+    """Uniform about the value in [disturbance]."""
+
+    kind: Literal["uniform"] = "uniform"
+    half_width: Annotated[NotNegative | None, Meaning("largest deviation " + BIAS_TEXT, "unit of d")] = None
+    scaled: ClassVar[Mapping[str, Scaled]] = {"half_width": BIAS}
+
+
+class UniformState(Uniform, frozen=True):
+    """Every state uniform about x0."""
+
+    kind: Literal["uniform"] = "uniform"
+    half_width: Annotated[
+        NotNegatives, Meaning("largest deviation, one number for each state; default: 1 each")
+    ] = ()  # fmt: skip
+
+
+class NormalState(Numbers, frozen=True):
+    """Every state normal about x0."""
+
+    kind: Literal["normal"] = "normal"
+    std: Annotated[NotNegatives, Meaning("1 sigma, one number for each state; default: 1 each")] = ()
+
+
+class NormalFactor(Numbers, frozen=True):
+    """The value times 1 + a normal number, truncated at three sigma."""
+
     distribution: ClassVar[str] = "truncated_normal"
-    norm_quantile: ClassVar[float] = 3.0
+    kind: Literal["relative_normal"] = "relative_normal"
+    std: Annotated[SmallFraction, Meaning("relative standard deviation")] = 0.1
 
 
-class RelativeUniform(Uniform, frozen=True):
-    """Factors 1 + a uniform number."""
+class UniformFactor(Uniform, frozen=True):
+    """The value times 1 + a uniform number."""
 
-    name: ClassVar[str] = "relative_uniform"
-
-
-def _numbers_kind(
-    name: str,
-    base: type[Numbers],
-    summary: str,
-    meaning: str,
-    unit: str,
-    default: Any,
-    type_: Any = NotNegative,
-    *,
-    deg: bool = False,
-) -> Any:
-    """Return the table of a kind, which has the width of `base` as its only key.
-
-    Args:
-        name: name of the class.
-        base: the distribution.
-        summary: docstring of the class.
-        meaning: meaning of the width.
-        unit: unit of the width.
-        default: default of the width; a `Scaled` one follows the mission.
-        type_: type of the width.
-        deg: whether the width is in degrees; its name then ends with _deg.
-    """
-    width_key, is_scaled = base.width_key + ("_deg" if deg else ""), isinstance(default, Scaled)
-    type_ = type_ | None if is_scaled else type_
-    key = (width_key, Annotated[type_, Meaning(meaning, unit)], None if is_scaled else default)
-    scaled = {width_key: default} if is_scaled else {}
-    namespace = {"__doc__": summary, "__module__": __name__, "width_key": width_key, "scaled": scaled}
-    kind = ("kind", Literal[base.name], base.name)
-    return msgspec.defstruct(name, [kind, key], bases=(base,), frozen=True, kw_only=True, namespace=namespace)
+    kind: Literal["relative_uniform"] = "relative_uniform"
+    half_width: Annotated[BelowOne, Meaning("largest relative deviation")] = 0.2
 
 
-_RATE, _BIAS = ("rad/s", Scaled(0.01, time=-1)), ("unit of d", Scaled(1e-3, inertia=1, order=-1))
-_RATE_TEXT, _BIAS_TEXT = "; default: 0.01, scaled to the mission", "; default: 1e-3, scaled to the mission"
-_EACH_STATE = ", one number for each state; default: 1 each"
-# each variable has the name of its class, so that pickle finds the class in this module
-NormalRate = _numbers_kind(
-    "NormalRate", Numbers, "Each axis normal about initial.rate.", "1 sigma per axis" + _RATE_TEXT, *_RATE
-)
-UniformRate = _numbers_kind(
-    "UniformRate", Uniform, "Each axis uniform about initial.rate.", "largest deviation per axis" + _RATE_TEXT, *_RATE
-)
-NormalBias = _numbers_kind(
-    "NormalBias", Numbers, "Normal about the value in [disturbance].", "1 sigma of each component" + _BIAS_TEXT, *_BIAS
-)
-UniformBias = _numbers_kind(
-    "UniformBias", Uniform, "Uniform about the value in [disturbance].",
-    "largest deviation of each component" + _BIAS_TEXT, *_BIAS,
-)  # fmt: skip
-UniformState = _numbers_kind(
-    "UniformState", Uniform, "Every state uniform about x0.", "largest deviation" + _EACH_STATE, "", (), NotNegatives
-)
-NormalState = _numbers_kind(
-    "NormalState", Numbers, "Every state normal about x0.", "1 sigma" + _EACH_STATE, "", (), NotNegatives
-)
-NormalFactor = _numbers_kind(
-    "NormalFactor", Relative, "The value times 1 + a normal number, truncated at three sigma.",
-    "relative standard deviation", "", 0.1, SmallFraction,
-)  # fmt: skip
-UniformFactor = _numbers_kind(
-    "UniformFactor", RelativeUniform, "The value times 1 + a uniform number.",
-    "largest relative deviation", "", 0.2, BelowOne,
-)  # fmt: skip
-NormalTurn = _numbers_kind(
-    "NormalTurn", Numbers, "Rotated by a normal rotation vector.", "1 sigma per component", "deg", 0.1, deg=True
-)
-UniformTurn = _numbers_kind(
-    "UniformTurn", Uniform, "Rotated by a rotation vector with uniform components.", "largest size of a component",
-    "deg", 0.1, deg=True,
-)  # fmt: skip
-FACTORS, TURNS = (NormalFactor, UniformFactor), (NormalTurn, UniformTurn)
+class NormalTurn(Numbers, frozen=True):
+    """Rotated by a normal rotation vector."""
+
+    width_key: ClassVar[str] = "std_deg"
+    kind: Literal["normal"] = "normal"
+    std_deg: Annotated[NotNegative, Meaning("1 sigma per component", "deg")] = 0.1
+
+
+class UniformTurn(Uniform, frozen=True):
+    """Rotated by a rotation vector with uniform components."""
+
+    width_key: ClassVar[str] = "half_width_deg"
+    kind: Literal["uniform"] = "uniform"
+    half_width_deg: Annotated[NotNegative, Meaning("largest size of a component", "deg")] = 0.1
 
 
 class UniformAttitude(Table, frozen=True):
@@ -306,27 +308,38 @@ class Jitter(Table, frozen=True):
         return interval([self.smallest], [self.largest])
 
 
+FACTORS: Kinds = {"relative_normal": NormalFactor, "relative_uniform": UniformFactor}
+TURNS: Kinds = {"normal": NormalTurn, "uniform": UniformTurn}
 # by key: its meaning and its kinds, the default first
-_DISTURBANCE: dict[str, tuple[str, tuple[Any, ...]]] = {
-    "disturbance_phase": ("phase of every sinusoid, and of gravity_gradient without [orbit]", (UniformPhase,)),
+_DISTURBANCE: dict[str, tuple[str, Kinds]] = {
+    "disturbance_phase": (
+        "phase of every sinusoid, and of gravity_gradient without [orbit]", {"uniform": UniformPhase}
+    ),
     "disturbance_amplitude": ("independent factor on each component of each sinusoid and constant", FACTORS),
-    "disturbance_bias": ("an additional constant disturbance", (NormalBias, UniformBias)),
-}
-_ANY_PLANT: dict[str, tuple[str, tuple[Any, ...]]] = {
+    "disturbance_bias": ("an additional constant disturbance", {"normal": NormalBias, "uniform": UniformBias}),
+}  # fmt: skip
+_ANY_PLANT: dict[str, tuple[str, Kinds]] = {
     "torque_limit": ("factor on hardware.torque_limit", FACTORS),
     "timing_jitter": (
-        "timing error of the samples as a fraction of loop.period; the flight software does not know it", (Jitter,),
+        "timing error of the samples as a fraction of loop.period; the flight software does not know it",
+        {"uniform": Jitter},
     ),
-    "custom": ("random quantities of custom code", (CUSTOM_DRAW,)),
-}  # fmt: skip
-_SPACECRAFT: dict[str, tuple[str, tuple[Any, ...]]] = {
-    "attitude": ("of the body at t = 0", (AxisAngle, UniformAttitude, NormalAttitude)),
-    "rate": ("of the body at t = 0", (NormalRate, UniformRate)),
+    "custom": ("random quantities of custom code", {"custom": CUSTOM_DRAW}),
+}
+_SPACECRAFT: dict[str, tuple[str, Kinds]] = {
+    "attitude": (
+        "of the body at t = 0",
+        {"axis_angle": AxisAngle, "uniform": UniformAttitude, "normal": NormalAttitude},
+    ),
+    "rate": ("of the body at t = 0", {"normal": NormalRate, "uniform": UniformRate}),
     "inertia": (
         "inertia of the true body about true_inertia; the law uses spacecraft.inertia",
-        (RelativeInertia, CorrelatedInertia),
+        {"relative_normal": RelativeInertia, "correlated": CorrelatedInertia},
     ),
-    "reference": ("a rotation of the whole reference", (NormalAttitude, UniformAttitude, AxisAngle)),
+    "reference": (
+        "a rotation of the whole reference",
+        {"normal": NormalAttitude, "uniform": UniformAttitude, "axis_angle": AxisAngle},
+    ),
     **_DISTURBANCE,
     "attitude_noise": ("factor on hardware.attitude_noise", FACTORS),
     "rate_noise": ("factor on hardware.rate_noise", FACTORS),
@@ -334,14 +347,14 @@ _SPACECRAFT: dict[str, tuple[str, tuple[Any, ...]]] = {
     "actuator_misalignment": ("a rotation of each axis or wheel that the flight software does not know", TURNS),
     "star_tracker_misalignment": ("a rotation of the star tracker in the body", TURNS),
     "gyro_scale": ("factor on the gyro's reading about each axis", FACTORS),
-    "star_tracker_outage": ("an interval without samples of the star tracker, with a filter", (Outage,)),
-    "wheel_failure": ("failure of one wheel: it has no torque from a random time on", (Failure,)),
+    "star_tracker_outage": ("an interval without samples of the star tracker, with a filter", {"uniform": Outage}),
+    "wheel_failure": ("failure of one wheel: it has no torque from a random time on", {"uniform": Failure}),
     "mode_frequency": ("factor on each of flexible.frequency", FACTORS),
     "mode_coupling": ("factor on each row of flexible.coupling", FACTORS),
     **_ANY_PLANT,
 }
-_STATE = {
-    "x0": ("initial state", (UniformState, NormalState)),
+_STATE: dict[str, tuple[str, Kinds]] = {
+    "x0": ("initial state", {"uniform": UniformState, "normal": NormalState}),
     **_DISTURBANCE,
     "state_noise": ("factor on hardware.state_noise", FACTORS),
     "actuator_scale": ("factor on each input that the computer does not know", FACTORS),
@@ -349,7 +362,7 @@ _STATE = {
 }
 
 
-def _dispersion_table(name: str, rows: Mapping[str, tuple[str, tuple[Any, ...]]]) -> Any:
+def _dispersion_table(name: str, rows: Mapping[str, tuple[str, Kinds]]) -> Any:
     summary = "Random quantities of each trial, each an inline table with a kind; the others stay nominal."
     keys = [(key, Annotated[Table | None, Meaning(meaning)], None) for key, (meaning, _) in rows.items()]
     namespace = {"__doc__": summary, "__module__": __name__}
@@ -357,7 +370,4 @@ def _dispersion_table(name: str, rows: Mapping[str, tuple[str, tuple[Any, ...]]]
 
 
 Dispersion, StateDispersion = _dispersion_table("Dispersion", _SPACECRAFT), _dispersion_table("StateDispersion", _STATE)
-DISPERSIONS: dict[str, Kinds] = {
-    key: {typing.get_args(typing.get_type_hints(one)["kind"])[0]: one for one in kinds}
-    for key, (_, kinds) in {**_SPACECRAFT, **_STATE}.items()
-}
+DISPERSIONS = {key: kinds for key, (_, kinds) in {**_SPACECRAFT, **_STATE}.items()}
