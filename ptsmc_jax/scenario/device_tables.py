@@ -329,30 +329,23 @@ class SteadyStateFilter(FilterTable, frozen=True):
     gains: ClassVar[tuple[str, ...]] = ("filter_bandwidth",)
     usual: ClassVar[Mapping[str, str]] = {"bandwidth": "bandwidth"}
 
-    @staticmethod
-    def _has_both_noises(table: Hardware) -> bool:
-        return bool(table.attitude_noise and (table.rate_noise or table.rate_noise_density))
-
-    def resolved_bandwidth(self, scenario: Any) -> float:
-        """Return the bandwidth [rad/s]. By default, star tracker and gyro noise have equal weight at it."""
-        if self.bandwidth is not None:
-            return self.bandwidth
+    def fill_defaults(self, scenario: Any) -> Any:
+        """Fill an absent bandwidth if both noises are greater than 0: they have equal weight at this bandwidth."""
         table, period = scenario.devices, scenario.loop.period
         noises = table.attitude_noise or 0.0, table.gyro_noise(period)
-        return formulas.best_bandwidth(*noises, period, table.interval(period))
-
-    def complete_for_file(self, scenario: Any) -> Any:
-        """Return the table with the default bandwidth filled in if both noises are greater than 0."""
-        has_noises = self._has_both_noises(scenario.devices)
-        return msgspec.structs.replace(self, bandwidth=self.resolved_bandwidth(scenario)) if has_noises else self
+        if self.bandwidth is not None or not all(noises):
+            return self
+        bandwidth = formulas.best_bandwidth(*noises, period, table.interval(period))
+        return msgspec.structs.replace(self, bandwidth=bandwidth)
 
     def immediate_noise_fraction(self, scenario: Any) -> float:
         """Return the attitude gain of a correction, see `devices.attitude_filter.filter_gains`."""
-        return -math.expm1(-2.0 * self.resolved_bandwidth(scenario) * scenario.devices.interval(scenario.loop.period))
+        bandwidth = self.fill_defaults(scenario).bandwidth
+        return -math.expm1(-2.0 * bandwidth * scenario.devices.interval(scenario.loop.period))
 
     def check(self, scenario: Any) -> None:
         """Raise ScenarioError if the bandwidth is absent and a noise that determines its default is 0."""
-        if self.bandwidth is None and not self._has_both_noises(scenario.devices):
+        if self.fill_defaults(scenario).bandwidth is None:
             raise ScenarioError(
                 "filter.bandwidth is absent, but must be given where attitude_noise or rate_noise of [hardware] is 0"
             )
@@ -361,11 +354,18 @@ class SteadyStateFilter(FilterTable, frozen=True):
         """Return a filter of `devices.attitude_filter`, or of `devices.star_times` with its own sample times."""
         table, period = scenario.devices, scenario.loop.period
         star, gyro, walk = table.attitude_noise or 0.0, table.gyro_noise(period), table.rate_bias_walk or 0.0
-        arguments = tuple(vector(v) for v in (self.resolved_bandwidth(scenario), star, gyro, walk, period))
+        arguments = tuple(vector(v) for v in (self.bandwidth, star, gyro, walk, period))
         periods, times = table.periods_per_sample(period), table.star_times(period)
         if times is None:
             return attitude_filter(*arguments, periods)
         return filter_between_samples(*arguments, times.interval, times.pattern)
+
+
+class KalmanFilter(SteadyStateFilter, frozen=True):
+    """The filter of [[sensors]], about as fast as a steady-state filter. It has no keys: the sensors determine it."""
+
+    kind: Literal["kalman"] = "kalman"
+    gains: ClassVar[tuple[str, ...]] = ()
 
 
 class WheelLimits(Table, frozen=True):

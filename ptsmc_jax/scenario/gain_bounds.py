@@ -220,7 +220,7 @@ def _usual_corner(context: BoundsContext) -> Interval:
 
 def _usual_bandwidth(context: BoundsContext) -> Interval:
     scenario = context.scenario
-    width = scenario.estimator.resolved_bandwidth(scenario)
+    width = scenario.estimator.bandwidth
     return 0.1 * width, min(10.0 * width, max(2.0 * width, 1.0 / scenario.devices.interval(scenario.loop.period)))
 
 

@@ -77,12 +77,13 @@ def resolve(scenario: Scenario) -> Scenario:
     scenario = msgspec.structs.replace(scenario, **{**tables, "loop": loop})
     checks.check_sensors(scenario)
     scenario.check_devices()
+    scenario = scenario.fill_plant_defaults()
     if loop.settling_angle is None:
         loop = msgspec.structs.replace(loop, settling_angle=scenario.default_settling_angle())
         scenario = msgspec.structs.replace(scenario, loop=loop)
     scenario = msgspec.structs.replace(scenario, controller=law.fill_defaults(scenario))
     observer = mission.fill_scaled_defaults(scenario.observer.fill_defaults(scenario), ratios)
-    return msgspec.structs.replace(scenario, observer=observer).fill_plant_defaults()
+    return msgspec.structs.replace(scenario, observer=observer)
 
 
 def complete(scenario: Scenario) -> Scenario:

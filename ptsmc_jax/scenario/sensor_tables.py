@@ -3,7 +3,6 @@
 Start with `SensorSuite`. `SENSORS` lists the classes by kind.
 """
 
-import math
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -16,7 +15,7 @@ from ptsmc_jax import formulas
 from ptsmc_jax.devices import attitude_sensors, kalman_filter, sensor_suite
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.scenario.custom import custom_kind
-from ptsmc_jax.scenario.device_tables import WHOLE_TOLERANCE, FilterTable, Hardware
+from ptsmc_jax.scenario.device_tables import WHOLE_TOLERANCE, Hardware
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.schema import PartTable
 from ptsmc_jax.scenario.values import Kinds, Meaning, NotNegative, Positive, Table, Three
@@ -243,20 +242,6 @@ SENSORS: Kinds = {
         "A custom sensor, a class derived from ptsmc_jax.AttitudeSensor; its fields are further keys.",
     ),
 }  # fmt: skip
-
-
-class KalmanFilter(FilterTable, frozen=True):
-    """The filter of [[sensors]]. It has no keys, since its design follows from the sensors."""
-
-    kind: Literal["kalman"] = "kalman"
-
-    def immediate_noise_fraction(self, scenario: Any) -> float:
-        """Return approximately the fraction of a reading's noise that reaches the law at once."""
-        hardware, period = scenario.devices, scenario.loop.period
-        bandwidth = formulas.best_bandwidth(
-            hardware.attitude_noise, hardware.gyro_noise(period), period, hardware.interval(period)
-        )
-        return -math.expm1(-2.0 * bandwidth * hardware.interval(period))
 
 
 class SensorSuite(Table, frozen=True):

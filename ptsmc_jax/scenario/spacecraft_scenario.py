@@ -13,9 +13,8 @@ from ptsmc_jax.declare import Scaled
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.plants.flexible_body import flexible
 from ptsmc_jax.plants.rigid_body import AttitudeState, spacecraft
-from ptsmc_jax.scenario import attitude_keys, dispersion_tables, errors, identify_tables, tables
+from ptsmc_jax.scenario import attitude_keys, device_tables, dispersion_tables, errors, identify_tables, tables
 from ptsmc_jax.scenario.custom_devices import SENSORS
-from ptsmc_jax.scenario.device_tables import FILTERS, WHEELS, FilterTable, Hardware, NoFilter, WheelLimits
 from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.law_tables import LAWS
@@ -23,7 +22,7 @@ from ptsmc_jax.scenario.observer_tables import OBSERVERS
 from ptsmc_jax.scenario.orbit_table import ORBITS, OrbitTable
 from ptsmc_jax.scenario.pointing_table import Pointing
 from ptsmc_jax.scenario.reference_tables import REFERENCES, Initial
-from ptsmc_jax.scenario.sensor_tables import KalmanFilter, SensorSuite
+from ptsmc_jax.scenario.sensor_tables import SensorSuite
 from ptsmc_jax.scenario.tables import Loop, Scenario, Tune
 from ptsmc_jax.scenario.values import Inertia, Kinds, Meaning, NotNegative, Positive, Table, Three
 from ptsmc_jax.simulation.catalogues import CATALOGUE
@@ -153,8 +152,8 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
     reference: Any  # `reference_tables.ReferenceTable`
     orbit: OrbitTable | None = None
     flexible: Flexible | None = None
-    wheels: WheelLimits | None = None
-    filter: FilterTable | None = None
+    wheels: device_tables.WheelLimits | None = None
+    filter: device_tables.FilterTable | None = None
     pointing: Pointing | None = None
 
     TABLES: ClassVar[Mapping[str, type[Table] | Kinds]] = {
@@ -168,10 +167,10 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         "controller": LAWS["spacecraft"],
         "observer": OBSERVERS["spacecraft"],
         "loop": Loop,
-        "hardware": Hardware,
+        "hardware": device_tables.Hardware,
         "sensors": SENSORS,
-        "wheels": WHEELS,
-        "filter": FILTERS,
+        "wheels": device_tables.WHEELS,
+        "filter": device_tables.FILTERS,
         "pointing": Pointing,
         "dispersion": dispersion_tables.Dispersion,
         "tune": Tune,
@@ -202,8 +201,8 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
     def estimator(self) -> Any:
         """The table [filter], `NoFilter` if it is absent, or the Kalman filter of [[sensors]]."""
         if isinstance(self.sensors, SensorSuite):
-            return KalmanFilter()
-        return NoFilter() if self.filter is None else self.filter
+            return device_tables.KalmanFilter()
+        return device_tables.NoFilter() if self.filter is None else self.filter
 
     @property
     def devices(self) -> Any:
@@ -273,12 +272,9 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         noise = self.devices.attitude_noise or 0.0
         return max(1e-3 * min(1.0, self.start_angle() or 1.0), min(5.0 * noise, 1.0))
 
-    def complete_for_file(self) -> Any:
-        """Return the scenario for a file, keys of the filter included."""
-        scenario = super().complete_for_file()
-        if self.filter is None:
-            return scenario
-        return msgspec.structs.replace(scenario, filter=self.filter.complete_for_file(self))
+    def fill_plant_defaults(self) -> Any:
+        """Return the scenario with the defaults of the filter."""
+        return msgspec.structs.replace(self, filter=None if self.filter is None else self.filter.fill_defaults(self))
 
     @property
     def true_inertia(self) -> Any:
