@@ -42,10 +42,6 @@ class CommandFilterTable(PartTable, frozen=True):
 
     prefix: ClassVar[str] = "command_"
 
-    def dead_time(self) -> float:
-        """Return the delay of the filter at low frequencies, the negative derivative of its phase [s]."""
-        return self.part_class.dead_time(self)
-
 
 COMMAND_FILTERS: Kinds = {
     "first_order": make_table(CommandFilterTable, command_filter.FirstOrder, "first_order"),
@@ -110,11 +106,8 @@ class Actuators(Table, frozen=True):
 
     def noise_of_s(self, scenario: Any) -> float:
         """Return the noise of the sliding variable in the hold phase, 1 sigma per axis and raw sample."""
-        return scenario.controller.noise_of_s(*self.noise_of_error(scenario))
-
-    def sensors(self, scenario: Any) -> Any:
-        """Return the sensors, a part of `devices.sensors`."""
-        raise NotImplementedError
+        law = scenario.controller
+        return law.law.noise_of_s(law, *self.noise_of_error(scenario))
 
     def actuators(self, wheels: Any) -> Any:
         """Return the actuators; `wheels`: the part of `devices.reaction_wheels`, or None."""
@@ -382,12 +375,10 @@ class WheelLimits(Table, frozen=True):
         ),
     ] = None
 
+    axes_key: ClassVar[str] = ""  # the key that determines the spin axes
+
     def spin_axes(self) -> Any:
         """Return the spin axis of each wheel in body axes (wheels, 3)."""
-        raise NotImplementedError
-
-    def axes_error(self, error: ValueError) -> ScenarioError:
-        """Return the configuration error for spin axes that are not allowed."""
         raise NotImplementedError
 
     def check(self) -> None:
@@ -396,7 +387,7 @@ class WheelLimits(Table, frozen=True):
         try:
             formulas.wheel_axes(axes)
         except ValueError as error:
-            raise self.axes_error(error) from None
+            raise errors.value_error(f"wheels.{self.axes_key}", getattr(self, self.axes_key), f": {error}") from None
         if self.momentum is not None and len(self.momentum) != len(axes):
             raise wrong("wheels.momentum", self.momentum, f"a list of {len(axes)} numbers, one for each wheel")
         limit = self.momentum_limit
@@ -416,15 +407,11 @@ class PyramidWheels(WheelLimits, frozen=True):
         Annotated[float, Meta(gt=0, lt=90, description="an angle between 0 and 90 degrees")],
         Meaning("tilt of the spin axes toward +z; the default gives equal torque about all axes", "deg"),
     ] = 35.264389682754654
+    axes_key: ClassVar[str] = "cant_deg"
 
     def spin_axes(self) -> Any:
         """Return the spin axes of four wheels (4, 3), tilted toward +z."""
         return formulas.pyramid(np.deg2rad(self.cant_deg))
-
-    def axes_error(self, error: ValueError) -> ScenarioError:
-        """Return the error for a cant angle whose wheels do not span all directions."""
-        allowed = "far enough from 0 and 90 degrees for the wheels to span all directions"
-        return wrong("wheels.cant_deg", self.cant_deg, allowed)
 
 
 class AxesWheels(WheelLimits, frozen=True):
@@ -439,14 +426,11 @@ class AxesWheels(WheelLimits, frozen=True):
         (0.0, 1.0, 0.0),
         (0.0, 0.0, 1.0),
     )
+    axes_key: ClassVar[str] = "axes"
 
     def spin_axes(self) -> Any:
         """Return `axes` as an array (wheels, 3)."""
         return np.asarray(self.axes)
-
-    def axes_error(self, error: ValueError) -> ScenarioError:
-        """Return the error for `axes`."""
-        return ScenarioError(f"wheels.axes is {errors.brief(self.spin_axes().tolist())}: {error}")
 
 
 # by kind, the default first

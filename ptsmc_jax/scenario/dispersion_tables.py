@@ -198,7 +198,6 @@ class NormalAttitude(Table, frozen=True):
 class RelativeInertia(Table, frozen=True):
     """Normal relative errors of the true principal moments, truncated at three sigma and to moments of a real body."""
 
-    largest_deviation: ClassVar[float] = 3.0  # largest deviation of a moment / std
     kind: Literal["relative_normal"] = "relative_normal"
     std: Annotated[SmallFraction, Meaning("relative standard deviation")] = 0.05
     axes_deg: Annotated[NotNegative, Meaning("1 sigma of the small rotation of the principal axes", "deg")] = 0.0

@@ -48,7 +48,9 @@ def compute(scenario: Any) -> tuple[float, float] | None:
         known = [term_bounds for term_bounds in bounds if term_bounds is not None]
         if len(known) < len(bounds):
             return None
-        largest = sum((term_bounds.size for term_bounds in known), np.zeros(inputs)) + _largest_bias(scenario)
+        bias = getattr(scenario.dispersion, "disturbance_bias", None)
+        largest_bias = 0.0 if bias is None else bias.largest
+        largest = sum((term_bounds.size for term_bounds in known), np.zeros(inputs)) + largest_bias
         fastest = sum((term_bounds.rate for term_bounds in known), np.zeros(inputs))
     if not np.all(np.isfinite([largest, fastest])):
         raise ScenarioError("disturbance has an infinite amplitude or rate; allowed are smaller numbers in the table")
@@ -58,12 +60,7 @@ def compute(scenario: Any) -> tuple[float, float] | None:
 def largest_factor(scenario: Any) -> float:
     """Return the largest random factor on the disturbance's amplitude."""
     amplitude = getattr(scenario.dispersion, "disturbance_amplitude", None)
-    return 1.0 if amplitude is None else 1.0 + amplitude.largest_deviation * getattr(amplitude, amplitude.width_key)
-
-
-def _largest_bias(scenario: Any) -> float:
-    bias = getattr(scenario.dispersion, "disturbance_bias", None)
-    return 0.0 if bias is None else bias.largest_deviation * getattr(bias, bias.width_key)
+    return 1.0 if amplitude is None else 1.0 + amplitude.largest
 
 
 def walk_rate(scenario: Any, density: np.ndarray) -> np.ndarray:

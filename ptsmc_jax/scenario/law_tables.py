@@ -74,11 +74,18 @@ class LawTable(PartTable, frozen=True):
         return self.free_by_default, tuple(name for name in extra if not (self.implicit and name == "sign_width"))
 
     def fill_defaults(self, scenario: Any) -> Any:
-        """Fill absent bounds of Assumption 1 from the disturbance, then absent gains by `designed`."""
+        """Fill absent bounds of Assumption 1 from the disturbance, then absent gains.
+
+        The gains are designed for the sampled loop. If the loop is continuous or the scenario is a published case, they
+        are the published gains, scaled to the mission.
+        """
         bounds = disturbance_bounds.compute(scenario)
         if bounds is not None:
             self = self._fill_absent(dict(zip(("disturbance_bound", "disturbance_rate_bound"), bounds, strict=True)))
-        filled = self._fill_absent(self.designed(msgspec.structs.replace(scenario, controller=self)))
+        filled = self
+        if scenario.sampled and not mission.is_published_case(scenario):
+            scenario = msgspec.structs.replace(scenario, controller=self)
+            filled = self._fill_absent(self.gains_of(mission.design(scenario), scenario))
         filled = filled._fill_absent(filled.published_in(mission.scales(scenario)))
         delta, by_default = getattr(filled, "delta", None), getattr(self, "delta", 0.0) is None
         if scenario.sampled and by_default and delta is not None:
@@ -88,16 +95,6 @@ class LawTable(PartTable, frozen=True):
     def _fill_absent(self, defaults: Mapping[str, Any]) -> Any:
         """Return the table with these values for its absent keys."""
         return msgspec.structs.replace(self, **{k: v for k, v in defaults.items() if getattr(self, k) is None})
-
-    def designed(self, scenario: Any) -> Mapping[str, float]:
-        """Return the gains that are designed for the sampled loop, by key.
-
-        There are none if the loop is continuous or if the scenario is a published case: `fill_defaults` then uses the
-        published gains, scaled to the mission.
-        """
-        if not scenario.sampled or mission.is_published_case(scenario):
-            return {}
-        return self.gains_of(mission.design(scenario), scenario)
 
     def published_in(self, scales: mission.Scales) -> dict[str, Any]:
         """Return the published gains by key, scaled to the units of a mission."""
@@ -110,20 +107,6 @@ class LawTable(PartTable, frozen=True):
         """
         published = self.published_in(mission.scales(scenario)._replace(time=1.0 / design.rate_factor))
         return self.law.designed(design, published)
-
-    def noise_of_s(self, position: float, velocity: float) -> float:
-        """Return the noise of the sliding variable s, 1 sigma.
-
-        Args:
-            position: noise of the error, 1 sigma.
-            velocity: noise of the error's rate, 1 sigma [1/s].
-        """
-        return self.law.noise_of_s(self, position, velocity)
-
-    def half_turn_rate(self, t_f: float) -> tuple[str, float]:
-        """Return the key that determines how fast the law turns the body, and the largest rate [rad/s]; `t_f` in s."""
-        key, rate = self.law.half_turn_rate(self, t_f)
-        return f"controller.{key}", rate
 
     def check(self, scenario: Any) -> None:
         """Raise ScenarioError if keys contradict each other or the scenario."""
@@ -154,16 +137,19 @@ class PrescribedTable(LawTable, frozen=True):
     ] = "explicit"
 
 
+ErrorKind = Annotated[
+    Literal["additive", "multiplicative"],
+    Meaning(
+        "definition of the error: additive, the paper's q_1 - q_1f, or multiplicative, the vector"
+        " part of q_f* q, which is singular only 180 degrees from the reference"
+    ),
+]
+
+
 class AttitudeTable(PrescribedTable, frozen=True):
     """The paper's law for a spacecraft."""
 
-    error: Annotated[
-        Literal["additive", "multiplicative"],
-        Meaning(
-            "definition of the error: additive, the paper's q_1 - q_1f, or multiplicative, the vector"
-            " part of q_f* q, which is singular only 180 degrees from the reference"
-        ),
-    ] = "additive"
+    error: ErrorKind = "additive"
 
 
 class CustomTable(LawTable, frozen=True):
@@ -179,18 +165,12 @@ class CustomTable(LawTable, frozen=True):
 class CustomAttitudeTable(CustomTable, frozen=True):
     """A custom law for a spacecraft."""
 
-    error: Annotated[
-        Literal["multiplicative", "additive"],
-        Meaning(
-            "definition of the error: multiplicative, the vector part of q_f* q, or additive, the paper's q_1 - q_1f"
-        ),
-    ] = "multiplicative"
+    error: ErrorKind = "multiplicative"
 
 
 def common_keys(law: LawTable) -> dict[str, Any]:
     """Return the keys that all laws share, with the values of this law."""
-    names = ("t_f", "disturbance_rate_bound", "disturbance_bound", "initial_estimate_error")
-    return {name: getattr(law, name) for name in names}
+    return {name: getattr(law, name) for name in LawTable.__struct_fields__}
 
 
 COMPARISON = {

@@ -128,28 +128,21 @@ class Design(NamedTuple):
         return min(1.0 / self.time, 2.0 * self.pole)
 
 
-class _PoleRange(NamedTuple):
-    """Slowest, most accurate and fastest pole rate p [1/s]."""
-
-    slowest: float
-    most_accurate: float
-    fastest: float
-
-
 def design(scenario: Any) -> Design:
     """Return the design whose predicted error in the hold phase is the smallest."""
-    return _design(scenario, _pole_range(scenario).most_accurate, _default_eta(scenario), OBSERVER_TO_POLE)
+    _, most_accurate, _ = _pole_range(scenario)
+    return _design(scenario, most_accurate, _default_eta(scenario), OBSERVER_TO_POLE)
 
 
 def starting_designs(scenario: Any) -> list[Design]:
     """Return starting points of a search: slow to fast hold phases, slow and fast observers, the default first."""
-    poles, eta = _pole_range(scenario), _default_eta(scenario)
+    (slowest, most_accurate, fastest), eta = _pole_range(scenario), _default_eta(scenario)
     stable_pole = MAX_POLE_TIMES_DEAD_TIME / dead_time(scenario)
-    pole_rates = [poles.most_accurate, poles.fastest, math.sqrt(poles.slowest * poles.fastest), poles.slowest]
-    pole_rates += [max(rate, poles.slowest) for rate in (stable_pole, math.sqrt(poles.fastest * stable_pole))]
+    pole_rates = [most_accurate, fastest, math.sqrt(slowest * fastest), slowest]
+    pole_rates += [max(rate, slowest) for rate in (stable_pole, math.sqrt(fastest * stable_pole))]
     pole_rates = [*dict.fromkeys(pole_rates)]
     designs = [_design(scenario, rate, eta, observer) for observer in (OBSERVER_TO_POLE, 0.1) for rate in pole_rates]
-    return [*designs, _design(scenario, poles.most_accurate, _smallest_eta(scenario), 0.3)]
+    return [*designs, _design(scenario, most_accurate, _smallest_eta(scenario), 0.3)]
 
 
 def dead_time(scenario: Any) -> float:
@@ -159,7 +152,7 @@ def dead_time(scenario: Any) -> float:
     return (
         (devices.delay_periods + 0.5) * period
         + (devices.torque_lag or 0.0)
-        + (0.0 if filtering is None else filtering.dead_time())
+        + (0.0 if filtering is None else filtering.part_class.dead_time(filtering))
     )
 
 
@@ -185,8 +178,8 @@ def _design(scenario: Any, pole: float, eta: float, observer: float) -> Design:
     return Design(eta, pole, rate * scenario.mean_inertia, width, scenario.reaching, scales(scenario).time)
 
 
-def _pole_range(scenario: Any) -> _PoleRange:
-    """Return the range of p, and the most accurate p in it.
+def _pole_range(scenario: Any) -> tuple[float, float, float]:
+    """Return the slowest, the most accurate and the fastest pole rate p [1/s].
 
     Dead time, flexible modes, and noise against the torque limit bound p from above. The most accurate p minimises the
     sum of the squares of three errors:
@@ -199,7 +192,7 @@ def _pole_range(scenario: Any) -> _PoleRange:
     slowest, fastest = MIN_POLE_TIMES_T_F / t_f, fastest_pole(scenario)
     if fastest <= slowest:  # use the larger of `fastest` and the p with delta = t_f / 2
         slow_pole = max(fastest, (2.0 * _smallest_eta(scenario) - 1.0) / t_f)
-        return _PoleRange(max(fastest, 0.1 * slow_pole), slow_pole, slow_pole)
+        return max(fastest, 0.1 * slow_pole), slow_pole, slow_pole
     position, velocity = scenario.devices.noise_of_error(scenario)
     position = 0.0 if scenario.estimator.on else position  # an attitude filter passes slow errors only
     # descending, so that argmin returns the fastest of rates with equal errors
@@ -207,7 +200,7 @@ def _pole_range(scenario: Any) -> _PoleRange:
     with np.errstate(all="ignore"):
         lag = _disturbance_bounds(scenario)[1] / (OBSERVER_TO_POLE * rates**3)
         error = lag**2 + position**2 * rates * period + velocity**2 * period / rates
-    return _PoleRange(slowest, float(rates[int(np.argmin(error))]), fastest)
+    return slowest, float(rates[int(np.argmin(error))]), fastest
 
 
 def _pole_limit_of_modes(scenario: Any) -> float:

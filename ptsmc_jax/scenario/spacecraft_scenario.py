@@ -15,6 +15,7 @@ from ptsmc_jax.plants.flexible_body import flexible
 from ptsmc_jax.plants.rigid_body import AttitudeState, spacecraft
 from ptsmc_jax.scenario import attitude_keys, device_tables, dispersion_tables, errors, identify_tables, tables
 from ptsmc_jax.scenario.custom_devices import SENSORS
+from ptsmc_jax.scenario.disturbance_bounds import SIGMAS
 from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.law_tables import LAWS
@@ -121,26 +122,17 @@ class Flexible(Table, frozen=True):
             dispersions: the table [dispersion].
         """
         rows: Any = getattr(dispersions, "mode_coupling", None)
-        moments: Any = getattr(dispersions, "inertia", None)
-        largest_factor = smallest_moment = 1.0
-        stated, moment_text = "", ""
-        if getattr(moments, "std", 0.0) > 0.0:
-            smallest_moment = 1.0 - moments.largest_deviation * moments.std
-            stated = f"dispersion.inertia.std is {moments.std}"
-            moment_text = f", and moments {smallest_moment:.6g} times as large"
-        if rows is not None and not rows.is_zero:
-            largest_factor = 1.0 + rows.largest_deviation * float(rows.widths()[0])
-            stated = f"dispersion.mode_coupling.{rows.width_key} is {getattr(rows, rows.width_key)}"
-        if not stated:
-            return
+        largest_factor = 1.0 if rows is None else 1.0 + rows.largest
+        smallest_moment = 1.0 - SIGMAS * getattr(getattr(dispersions, "inertia", None), "std", 0.0)
         try:
             formulas.rest_inertia(
                 smallest_moment * formulas.check_inertia(inertia), largest_factor * np.asarray(self.coupling)
             )
         except ValueError as error:
             raise ScenarioError(
-                f"{stated}, but with rows {largest_factor:.6g} times those of flexible.coupling{moment_text}, "
-                f"which a trial may have, {error}"
+                "dispersion.mode_coupling or dispersion.inertia is too large: a trial may have rows "
+                f"{largest_factor:.6g} times those of flexible.coupling and moments {smallest_moment:.6g} times the "
+                f"nominal ones, but {error}"
             ) from None
 
 
@@ -368,17 +360,16 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
             t_f: shortest prescribed time [s].
         """
         frequencies = {**self._initial_rates, **self.reference.frequencies(self)}
-        key, rate = self.controller.half_turn_rate(t_f)
-        if not self.controller.law.prescribed:
+        law = self.controller.law
+        key, rate = law.half_turn_rate(self.controller, t_f)
+        if not law.prescribed:
             rate = min(rate, 0.5 * MAX_COMPARISON_STEPS * 0.025 / self.loop.period)
-        frequencies[key] = rate
+        frequencies[f"controller.{key}"] = rate
         for key, rate in self._nutation_rates(setup).items():
             frequencies[key] = frequencies.get(key, 0.0) + rate
         if self.flexible is not None:
             modes, dispersion = self.flexible, getattr(self.dispersion, "mode_frequency", None)
-            largest_factor = (
-                1.0 if dispersion is None else 1.0 + dispersion.largest_deviation * float(dispersion.widths()[0])
-            )
+            largest_factor = 1.0 if dispersion is None else 1.0 + dispersion.largest
             inertia = np.asarray(setup.plant.inertia)
             fastest = formulas.free_mode_frequencies(inertia, modes.frequency, modes.coupling).max()
             frequencies["flexible.frequency"] = largest_factor * float(fastest)
