@@ -1,25 +1,34 @@
-"""The tables [initial] and [reference] of scenario files of a spacecraft, with the references by kind in `REFERENCES`.
+"""The tables [initial], [orbit] and [reference] of scenario files of a spacecraft, by kind in `ORBITS`, `REFERENCES`.
 
-The numbers of a reference are declared in `signals.references`. Start with `ReferenceTable`.
+The numbers of a reference are declared in `signals`. Start with `ReferenceTable`.
 """
 
-from typing import Annotated, Any, Literal
+import dataclasses
+import functools
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import numpy as np
 from msgspec import Meta
 
 from ptsmc_jax.numerics.pytrees import vector
-from ptsmc_jax.scenario import attitude_files, attitude_keys, missions
+from ptsmc_jax.scenario import attitude_files, attitude_keys, epochs
 from ptsmc_jax.scenario.attitude_keys import Attitude
 from ptsmc_jax.scenario.custom import Custom, custom_kind, fastest_rate
 from ptsmc_jax.scenario.errors import ScenarioError, show, value_error, wrong
-from ptsmc_jax.scenario.missions import DIRECTIONS, Vector
 from ptsmc_jax.scenario.schema import PartTable, make_table
 from ptsmc_jax.scenario.values import Four, Kinds, Meaning, Number, Three
 from ptsmc_jax.signals import attitude_tables, mission_references, orbits, references
 
+Vector = Annotated[
+    Literal["nadir", "velocity", "orbit_normal", "sun"] | tuple[float, float, float],
+    Meta(description='"nadir", "velocity", "orbit_normal", "sun" or three numbers'),
+]
+IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 LARGEST_LATITUDE = np.pi / 2  # [rad]
+SMALLEST_ANGLE = np.deg2rad(0.1)  # smallest angle between the two directions, and between the two body axes [rad]
+POINTS, MOST_POINTS = 2048, 2**17  # smallest and largest number of anchors along the run
+LARGEST_TURN = 0.05  # largest rotation of the reference between two anchors [rad]
 
 
 class Initial(Attitude, frozen=True):
@@ -153,6 +162,68 @@ class FileReference(ReferenceTable, frozen=True):
         return samples.quaternions[k]
 
 
+class OrbitTable(PartTable, frozen=True):
+    """The orbit of references that point to the Earth, and of the gravity gradient."""
+
+    true_anomaly: Annotated[Number, Meaning("angle from perigee to the spacecraft at t = 0", "rad")] = 0.0
+
+    @property
+    def mean_anomaly(self) -> float:
+        """Mean anomaly at t = 0 [rad]."""
+        return orbits.mean_anomaly(self.true_anomaly, float(self.eccentricity))  # pyright: ignore
+
+    def build(self, epoch: str | None) -> Any:
+        """Build the orbit with NumPy numbers; epoch: value of `loop.epoch`."""
+        numbers = {field.name: getattr(self, field.name) for field in dataclasses.fields(orbits.Orbit)}
+        if numbers["earth_angle"] is None:
+            numbers["earth_angle"] = 0.0 if epoch is None else orbits.earth_angle(epochs.parse_key(epoch).days)
+        return self.part_class(**{name: np.float64(value) for name, value in numbers.items()})
+
+
+ORBITS: Kinds = {"kepler": make_table(OrbitTable, orbits.Orbit, "kepler")}
+
+
+class Mission(NamedTuple):
+    """The keys of a scenario that directions depend on."""
+
+    orbit: Any  # `OrbitTable`, or None
+    epoch: str | None  # `loop.epoch`
+    end: float  # end of the run [s]
+
+    @classmethod
+    def of(cls, scenario: Any) -> "Mission":
+        """Return the mission of a scenario."""
+        return cls(scenario.orbit, scenario.loop.epoch, scenario.end)
+
+    def build_orbit(self, user: str) -> Any:
+        """Return the orbit; raise ScenarioError without [orbit]. `user` is the key that needs it, for the error."""
+        if self.orbit is None:
+            raise ScenarioError(f"{user}, which needs an orbit, but there is no [orbit] table")
+        return self.orbit.build(self.epoch)
+
+    def direction(self, key: str, value: Any) -> Any:
+        """Return the direction of a key: a name, or a vector (3,); raise ScenarioError if another table is missing."""
+        if not isinstance(value, str):
+            _check_axis(key, value)
+            return orbits.Fixed(np.array(value, dtype=float))
+        if value == "sun":
+            if self.epoch is None:
+                raise ScenarioError(f'{key} is "sun", which needs loop.epoch, such as "2026-03-20T12:00:00"')
+            return orbits.sun_direction(epochs.parse_key(self.epoch).days)
+        self.build_orbit(f'{key} is "{value}"')
+        return orbits.OrbitDirection(value)
+
+
+def _check_axis(key: str, axis: tuple[float, ...], other: tuple[float, ...] | None = None) -> None:
+    """Raise ScenarioError if a body axis (3,) is zero, or parallel to another one; key: its key."""
+    if np.linalg.norm(axis) == 0.0:
+        raise wrong(key, axis, "three numbers that are not all 0")
+    if other is not None:
+        sine = np.linalg.norm(np.cross(axis, other)) / (np.linalg.norm(axis) * np.linalg.norm(other))
+        if sine < np.sin(SMALLEST_ANGLE):
+            raise wrong(key, axis, f"an axis that is not parallel to reference.primary_axis = {list(other)}")
+
+
 class MissionTable(ReferenceTable, frozen=True):
     """A reference that points body axes in directions of the mission."""
 
@@ -167,60 +238,123 @@ class MissionTable(ReferenceTable, frozen=True):
         return mission_references.mounting(self.primary_axis, self.secondary_axis)
 
     def check(self, scenario: Any) -> None:
-        missions.check_axes("reference.primary_axis", self.primary_axis)
-        missions.check_axes("reference.secondary_axis", self.secondary_axis, self.primary_axis)
+        _check_axis("reference.primary_axis", self.primary_axis)
+        _check_axis("reference.secondary_axis", self.secondary_axis, self.primary_axis)
+
+    def initial_frame(self, scenario: Any) -> np.ndarray:
+        """Return the rotation matrix (3, 3) at t = 0 from the axes of the frame to inertial axes."""
+        raise NotImplementedError
+
+    def initial_reference_attitude(self, scenario: Any) -> np.ndarray:
+        from scipy.spatial.transform import Rotation
+
+        self.check(scenario)
+        return (Rotation.from_matrix(self.initial_frame(scenario)) * Rotation.from_quat(self.mount)).as_quat()
 
 
 class NadirTable(MissionTable, frozen=True):
     """Local vertical, local horizontal."""
 
-    def _require_orbit(self, scenario: Any) -> Any:
+    def _orbit(self, scenario: Any) -> Any:
         """Return the orbit of the scenario; raise ScenarioError if there is no [orbit] table."""
-        return missions.require_orbit(missions.from_scenario(scenario), 'reference.kind is "nadir"')
+        return Mission.of(scenario).build_orbit('reference.kind is "nadir"')
 
     def frequencies(self, scenario: Any) -> dict[str, float]:
-        return {"reference.kind": float(self._require_orbit(scenario).fastest())}
+        return {"reference.kind": float(self._orbit(scenario).fastest())}
 
     def check(self, scenario: Any) -> None:
         super().check(scenario)
-        self._require_orbit(scenario)
+        self._orbit(scenario)
 
     @property
     def mount(self) -> np.ndarray:
         return mission_references.nadir_mounting(self.primary_axis, self.secondary_axis)
 
     def build(self, scenario: Any) -> Any:
-        part = self.part_class(q=missions.IDENTITY, mount=self.mount, orbit=self._require_orbit(scenario))
-        return jax.tree.map(vector, part)
+        return jax.tree.map(vector, self.part_class(q=IDENTITY, mount=self.mount, orbit=self._orbit(scenario)))
 
-    def initial_reference_attitude(self, scenario: Any) -> np.ndarray:
-        self.check(scenario)
-        axes = self._require_orbit(scenario)(np.zeros(()), np)
-        return missions.mounted_quaternion(np.stack([axes.radial, axes.along, axes.normal], axis=1), self.mount)
+    def initial_frame(self, scenario: Any) -> np.ndarray:
+        place = self._orbit(scenario)(np.zeros(()), np)
+        return np.stack([place.radial, place.along, place.normal], axis=1)
 
 
 class DirectionsTable(MissionTable, frozen=True):
     """References with a primary and a secondary direction."""
 
-    def directions(self, mission: missions.Mission) -> tuple[Any, Any]:
+    def directions(self, mission: Mission) -> tuple[Any, Any]:
         """Return the primary and the secondary direction, parts of `signals.orbits`."""
         raise NotImplementedError
 
+    def numpy_part(self, mission: Mission, anchors: np.ndarray = IDENTITY[None], rate: float = 0.0) -> Any:
+        """Build the reference with NumPy numbers."""
+        primary, secondary = self.directions(mission)
+        needs_orbit = primary.needs_orbit or secondary.needs_orbit
+        return self.part_class(
+            q=IDENTITY, mount=self.mount, primary=primary, secondary=secondary,
+            orbit=mission.build_orbit("reference") if needs_orbit else None,
+            anchors=anchors, anchor_rate=np.float64(rate),
+        )  # fmt: skip
+
     def frequencies(self, scenario: Any) -> dict[str, float]:
-        return {"reference.kind": missions.sample_reference(self, missions.from_scenario(scenario)).fastest}
+        return {"reference.kind": _sample(self, Mission.of(scenario)).fastest}
 
     def check(self, scenario: Any) -> None:
         super().check(scenario)
-        missions.sample_reference(self, missions.from_scenario(scenario))
+        _sample(self, Mission.of(scenario))
 
     def build(self, scenario: Any) -> Any:
-        return missions.build_reference(self, missions.from_scenario(scenario))
+        mission = Mission.of(scenario)
+        samples = _sample(self, mission)
+        part = self.numpy_part(mission, samples.anchors, len(samples.anchors) / samples.span)
+        return jax.tree.map(vector, part)
 
-    def initial_reference_attitude(self, scenario: Any) -> np.ndarray:
-        self.check(scenario)
-        return missions.mounted_quaternion(
-            missions.sample_reference(self, missions.from_scenario(scenario)).matrix, self.mount
-        )
+    def initial_frame(self, scenario: Any) -> np.ndarray:
+        return _sample(self, Mission.of(scenario)).matrix
+
+
+class SampledReference(NamedTuple):
+    """A reference with two directions, sampled along a run."""
+
+    anchors: np.ndarray  # (n, 4) quaternions of the frame at equal intervals of `span`, see `TwoVectorReference`
+    span: float  # time from the first to the last anchor [s]
+    fastest: float  # largest rate, plus the root of the largest acceleration [rad/s]
+    matrix: np.ndarray  # (3, 3) rotation at t = 0 from the axes of the frame to inertial axes
+
+
+@functools.lru_cache(maxsize=32)
+def _sample(table: Any, mission: Mission) -> SampledReference:
+    """Sample a reference with two directions over twice the run if possible, because tuning may move t_end.
+
+    Raises:
+        ScenarioError: the directions are parallel during the run.
+    """
+    from scipy.spatial.transform import Rotation
+
+    part, run_lengths, anchor_count = table.numpy_part(mission), 2, POINTS
+    while True:
+        step = run_lengths * mission.end / anchor_count
+        times = step * np.arange(anchor_count)
+        sines = np.linalg.norm(np.cross(*part.directions(times, np)), axis=1)
+        closest = int(np.argmin(sines))
+        if sines[closest] < np.sin(SMALLEST_ANGLE) and times[closest] <= mission.end:
+            angle = np.rad2deg(np.arcsin(sines[closest]))
+            raise value_error(
+                "reference.secondary", table.secondary,
+                f", but at t = {times[closest]:.6g} s that is {angle:.2g} deg from the primary direction or its "
+                f"opposite, and at least {np.rad2deg(SMALLEST_ANGLE):.2g} deg are needed",
+            )  # fmt: skip
+        if sines[closest] < np.sin(SMALLEST_ANGLE):
+            run_lengths = 1
+            continue
+        matrices = part.matrix(times, np)
+        turns = Rotation.from_matrix(np.swapaxes(matrices[:-1], 1, 2) @ matrices[1:]).as_rotvec()
+        if np.all(np.linalg.norm(turns, axis=1) < LARGEST_TURN) or anchor_count >= MOST_POINTS:
+            break
+        anchor_count *= 4
+    rates = turns[: anchor_count // run_lengths] / step
+    fastest = np.linalg.norm(rates, axis=1).max() + np.sqrt(np.linalg.norm(np.diff(rates, axis=0), axis=1).max() / step)
+    span = run_lengths * mission.end
+    return SampledReference(mission_references.anchor_quaternions(matrices), span, float(fastest), matrices[0])
 
 
 SECONDARY = Meaning("direction of `secondary_axis`: a name, or three numbers in inertial axes")
@@ -240,24 +374,32 @@ class GroundTargetTable(DirectionsTable, frozen=True):
         super().check(scenario)
 
     def lowest_elevation(self, scenario: Any) -> tuple[float, float]:
-        """Return the lowest elevation above the horizon of the target [rad], and its time [s]."""
-        return missions.lowest_elevation(self, missions.from_scenario(scenario))
+        """Return the lowest elevation of the spacecraft above the target's horizon [rad], and its time [s]."""
+        part, times = self.numpy_part(Mission.of(scenario)), np.linspace(0.0, scenario.end, POINTS)
+        to_target, _ = part.directions(times, np)
+        angle = part.orbit.earth_angle + orbits.EARTH_RATE * times + self.longitude
+        cos_lat = np.cos(self.latitude)
+        sin_lat = np.full_like(angle, np.sin(self.latitude))
+        up = np.stack([cos_lat * np.cos(angle), cos_lat * np.sin(angle), sin_lat], axis=1)
+        sines = -np.sum(to_target * up, axis=1)
+        return float(np.arcsin(sines.min())), float(times[np.argmin(sines)])
 
-    def directions(self, mission: missions.Mission) -> tuple[Any, Any]:
+    def directions(self, mission: Mission) -> tuple[Any, Any]:
         point = orbits.ground_point(self.latitude, self.longitude, self.height)
-        return orbits.GroundPoint(point), missions.build_direction("reference.secondary", self.secondary, mission)
+        return orbits.GroundPoint(point), mission.direction("reference.secondary", self.secondary)
 
 
 class TwoVectorTable(DirectionsTable, frozen=True):
     """One body axis points exactly in a direction, another one as near as possible to a second direction."""
 
-    primary: Annotated[Vector, Meaning(f"direction of `primary_axis`: {DIRECTIONS}")] = "sun"
+    primary: Annotated[
+        Vector, Meaning("direction of `primary_axis`: a name, or three numbers in inertial axes")
+    ] = "sun"  # fmt: skip
     secondary: Annotated[Vector, SECONDARY] = (0.0, 0.0, 1.0)
 
-    def directions(self, mission: missions.Mission) -> tuple[Any, Any]:
-        key_values = ("reference.primary", self.primary), ("reference.secondary", self.secondary)
-        primary, secondary = (missions.build_direction(*each, mission) for each in key_values)
-        return primary, secondary
+    def directions(self, mission: Mission) -> tuple[Any, Any]:
+        primary = mission.direction("reference.primary", self.primary)
+        return primary, mission.direction("reference.secondary", self.secondary)
 
 
 # by kind, the default first

@@ -20,9 +20,8 @@ from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.scenario.observer_tables import OBSERVERS
-from ptsmc_jax.scenario.orbit_table import ORBITS, OrbitTable
 from ptsmc_jax.scenario.pointing_table import Pointing
-from ptsmc_jax.scenario.reference_tables import REFERENCES, Initial
+from ptsmc_jax.scenario.reference_tables import ORBITS, REFERENCES, Initial, OrbitTable
 from ptsmc_jax.scenario.sensor_tables import SensorSuite
 from ptsmc_jax.scenario.tables import Loop, Scenario, Tune
 from ptsmc_jax.scenario.values import Inertia, Kinds, Meaning, NotNegative, Positive, Table, Three

@@ -137,13 +137,6 @@ def nadir_mounting(primary: object, secondary: object) -> np.ndarray:
     return (Rotation.from_quat(orbit_to_frame).inv() * Rotation.from_quat(to_frame)).as_quat()
 
 
-def successive_rotations(matrices: np.ndarray) -> np.ndarray:
-    """Return the rotation vectors (n - 1, 3) [rad] from each rotation matrix of (n, 3, 3) to the next one."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_matrix(np.swapaxes(matrices[:-1], 1, 2) @ matrices[1:]).as_rotvec()
-
-
 def anchor_quaternions(matrices: np.ndarray) -> np.ndarray:
     """Return quaternions (n, 4) of rotation matrices (m, 3, 3) at equal intervals of time, without jumps of sign.
 

@@ -6,7 +6,7 @@ nutation, polar motion and orbit perturbations are neglected. Start with `Orbit`
 The functions also run in NumPy. Reading a scenario needs the first attitude for its defaults, and must not start JAX.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
@@ -192,30 +192,18 @@ class Fixed(Direction):
 
 @pytree
 @dataclass(frozen=True)
-class Nadir(Direction):
-    """The direction to the Earth's centre."""
+class OrbitDirection(Direction):
+    """The direction to the Earth's centre, of the velocity, or of the orbit's angular momentum."""
+
+    name: str = field(metadata={"static": True})  # "nadir", "velocity" or "orbit_normal"
 
     def __call__(self, t: Any, place: Any, orbit: Any, xp: Any) -> Any:
-        return -place.radial
-
-
-@pytree
-@dataclass(frozen=True)
-class Velocity(Direction):
-    """The direction of the velocity."""
-
-    def __call__(self, t: Any, place: Any, orbit: Any, xp: Any) -> Any:
+        if self.name == "nadir":
+            return -place.radial
+        if self.name == "orbit_normal":
+            return place.normal
         outward, along = orbit.eccentricity * xp.sin(place.anomaly), 1.0 + orbit.eccentricity * xp.cos(place.anomaly)
         return outward[..., None] * place.radial + along[..., None] * place.along
-
-
-@pytree
-@dataclass(frozen=True)
-class OrbitNormal(Direction):
-    """The direction of the orbit's angular momentum."""
-
-    def __call__(self, t: Any, place: Any, orbit: Any, xp: Any) -> Any:
-        return place.normal
 
 
 @pytree
