@@ -3,6 +3,7 @@
 Start with `SensorSuite`. `SENSORS` lists the classes by kind.
 """
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -104,22 +105,15 @@ class AttitudeSensorTable(SensorTable, frozen=True):
 
     def build(self, name: str, period: float) -> Any:
         """Return the part of `devices.attitude_sensors`; name: its name, period: control period [s]."""
-        raise NotImplementedError
-
-    def common_fields(self, name: str, period: float) -> dict[str, Any]:
-        """Return the fields that all attitude sensors share; name: its name, period: control period [s]."""
-        return {
-            "name": name,
-            "noise": vector(self.sigmas()),
-            "mounting": vector(self.mounting()),
-            "times": attitude_sensors.sample_times(self.interval(period), self.latency, period),
-        }
+        times = attitude_sensors.sample_times(self.interval(period), self.latency, period)
+        return self.part(name=name, noise=vector(self.sigmas()), mounting=vector(self.mounting()), times=times)
 
 
 class StarTracker(AttitudeSensorTable, frozen=True):
     """A star tracker."""
 
     kind: Literal["star_tracker"] = "star_tracker"
+    part_class: ClassVar[Any] = attitude_sensors.StarTracker
     noise_across: Annotated[Noise, Meaning("1 sigma of a reading about each axis across the boresight", "rad")] = None
     noise_about: Annotated[Noise, Meaning("1 sigma of a reading about the boresight; default: noise_across", "rad")] = (
         None
@@ -138,15 +132,12 @@ class StarTracker(AttitudeSensorTable, frozen=True):
         axes = Rotation.from_quat(self.mounting()).as_matrix()
         return axes @ np.diag(np.array(self.sigmas()) ** -2.0) @ axes.T
 
-    def build(self, name: str, period: float) -> Any:
-        """Return `attitude_sensors.StarTracker`."""
-        return attitude_sensors.StarTracker(**self.common_fields(name, period))
-
 
 class VectorSensor(AttitudeSensorTable, frozen=True):
     """A sun sensor or magnetometer: it measures a direction that is known in inertial axes."""
 
     kind: Literal["vector_sensor"] = "vector_sensor"
+    part_class: ClassVar[Any] = attitude_sensors.VectorSensor
     direction: Annotated[Three | None, Meaning("measured direction, in inertial axes")] = None
     noise: Annotated[Noise, Meaning("1 sigma of each component of the direction, in the sensor's axes", "rad")] = None
     required: ClassVar[tuple[str, ...]] = ("direction", "noise")
@@ -171,8 +162,7 @@ class VectorSensor(AttitudeSensorTable, frozen=True):
         return direction / np.linalg.norm(direction)
 
     def build(self, name: str, period: float) -> Any:
-        """Return `attitude_sensors.VectorSensor`."""
-        return attitude_sensors.VectorSensor(**self.common_fields(name, period), direction=vector(self.unit_direction))
+        return dataclasses.replace(super().build(name, period), direction=vector(self.unit_direction))
 
 
 class CustomTable(AttitudeSensorTable, frozen=True):
@@ -197,7 +187,7 @@ class CustomTable(AttitudeSensorTable, frozen=True):
 
     def build(self, name: str, period: float) -> Any:
         """Return the sensor; raise ScenarioError if the numbers of noises and of components of a reading differ."""
-        sensor = self.part(**self.common_fields(name, period))
+        sensor = super().build(name, period)
         reading = sensor.read(jnp.array([0.0, 0.0, 0.0, 1.0]))
         component_count = np.size(sensor.change(reading, reading))
         if component_count != len(self.sigmas()):
@@ -299,15 +289,13 @@ class SensorSuite(Table, frozen=True):
         noise, bias, walk = (float(np.linalg.norm(weights * values)) for values in zip(*errors, strict=True))
         return noise, bias, walk
 
-    def equivalent_hardware(self, table: Hardware, period: float | None) -> Hardware:
+    def equivalent_hardware(self, table: Hardware, period: float) -> Hardware:
         """Return [hardware] with one star tracker and one gyro of about the same accuracy, for defaults and bounds.
 
         Args:
             table: [hardware] of the scenario.
-            period: control period [s], None if it is not known yet; the table is then returned unchanged.
+            period: control period [s].
         """
-        if period is None:  # the loop is continuous, or its period is not known yet
-            return table
         intervals = {name: max(sensor.interval(period), period) for name, sensor in self.attitude.items()}
         interval = min(intervals.values())
         information_rate = sum(sensor.information() / intervals[name] for name, sensor in self.attitude.items())
