@@ -63,20 +63,6 @@ def largest_factor(scenario: Any) -> float:
     return 1.0 if amplitude is None else 1.0 + amplitude.largest
 
 
-def walk_rate(scenario: Any, density: np.ndarray) -> np.ndarray:
-    """Return a bound c [unit of d/s] on the rate of a random walk, which has no exact bound.
-
-    It is three sigma of the change of the walk over the time constant J / l of the default observer, divided by that
-    time constant. With this c, K2 = c J / l covers three sigma of the estimate's error.
-
-    Args:
-        scenario: the scenario, for the observer's time constant.
-        density: density of the walk (m,) [unit of d/sqrt(s)].
-    """
-    time_constant = 1.0 / observer_rate(scenario)
-    return SIGMAS * density / math.sqrt(time_constant)
-
-
 def observer_rate(scenario: Any) -> float:
     """Return l / J of the published observer [1/s], scaled to the mission and at most 1 / h.
 
@@ -96,16 +82,6 @@ def observer_gain(scenario: Any) -> float:
     return observer_rate(scenario) * scenario.mean_inertia
 
 
-def body_rate_bound(scenario: Any) -> float:
-    """Return an approximate bound on the body rate [rad/s].
-
-    It is the sum of the initial rate, the rate of the reference, and 2 pi / t_f, which is twice the mean rate of half a
-    turn within t_f.
-    """
-    reference_rate = sum(scenario.reference.frequencies(scenario).values())
-    return scenario.initial_rate_bound + reference_rate + 2.0 * math.pi / scenario.controller.t_f
-
-
 def has_unloaded_reference(scenario: Any) -> bool:
     """Whether the reference is custom code that has not run yet, so that its rate is unknown."""
     return getattr(getattr(scenario, "reference", None), "is_unloaded", False)
@@ -116,7 +92,9 @@ def gravity_gradient(scenario: Any, orbit_rate: float, eccentricity: float = 0.0
 
     They follow from |c x J c| <= (J_3 - J_1) / 2 and |(c x J c)'| <= (J_3 - J_1) |c'|. J_1 and J_3 are the smallest and
     the largest principal moment of the true body. If the inertia is dispersed, J_1 is decreased and J_3 increased by
-    three sigma. c moves in body axes with the rates of the orbit and of the body.
+    three sigma. c moves in body axes with the rates of the orbit and of the body. The bound on the body rate is the sum
+    of the initial rate, the rate of the reference, and 2 pi / t_f, which is twice the mean rate of half a turn within
+    t_f.
 
     On an eccentric orbit the torque is largest at perigee, where 3 n^2 becomes 3 n^2 / (1 - e)^3. The relative rate of
     the distance is at most e times the angular rate of the radius vector at perigee.
@@ -134,9 +112,9 @@ def gravity_gradient(scenario: Any, orbit_rate: float, eccentricity: float = 0.0
     e = eccentricity
     factor = 3.0 * orbit_rate * orbit_rate * moment_difference / (1.0 - e) ** 3
     perigee_rate = orbit_rate * math.sqrt(1.0 + e) / (1.0 - e) ** 1.5
-    return Bounds(
-        np.full(3, 0.5 * factor), np.full(3, factor * ((1.0 + 1.5 * e) * perigee_rate + body_rate_bound(scenario)))
-    )
+    reference_rate = sum(scenario.reference.frequencies(scenario).values())
+    body_rate = scenario.initial_rate_bound + reference_rate + 2.0 * math.pi / scenario.controller.t_f
+    return Bounds(np.full(3, 0.5 * factor), np.full(3, factor * ((1.0 + 1.5 * e) * perigee_rate + body_rate)))
 
 
 def path_bounds(scenario: Any, signal: Any, fastest: float = 0.0) -> Bounds:

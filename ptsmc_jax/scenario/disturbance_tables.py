@@ -121,7 +121,7 @@ class GravityTable(Attitude, DisturbanceTable, frozen=True):
             for key, value in replaced.items():
                 if value is not None:
                     raise wrong(f"{name}.{key}", value, "absent: [orbit] determines the gravity gradient")
-        if attitude_keys.has_attitude(self):
+        if attitude_keys.stated_keys(self):
             attitude_keys.quaternion(self, name)
         elif self.sequence is not None:
             raise ScenarioError(
@@ -153,7 +153,7 @@ class GravityTable(Attitude, DisturbanceTable, frozen=True):
         if scenario.orbit is not None:
             orbit = jax.tree.map(vector, scenario.orbit.build(scenario.loop.epoch))
             return disturbances.KeplerGravityGradient(inertia, orbit)
-        has_attitude = attitude_keys.has_attitude(self)
+        has_attitude = attitude_keys.stated_keys(self)
         orbit = attitude_keys.quaternion(self, "disturbance") if has_attitude else np.array([0.0, 0.0, 0.0, 1.0])
         return self.part(inertia=inertia, orbit=vector(orbit), orbit_rate=vector(self.rate))
 
@@ -164,10 +164,14 @@ class RandomWalkTable(DisturbanceTable, frozen=True):
     sampled_only: ClassVar[bool] = True
 
     def bounds(self, scenario: Any) -> Bounds:
-        """Return three sigma at the end of the run, and `disturbance_bounds.walk_rate`."""
-        density = np.asarray(self.density)  # pyright: ignore[reportAttributeAccessIssue]
-        largest = disturbance_bounds.SIGMAS * density * np.sqrt(scenario.loop.t_end)
-        return Bounds(largest, disturbance_bounds.walk_rate(scenario, density))
+        """Return three sigma at the end of the run, and a bound on the rate of the walk, which has no exact bound.
+
+        It is three sigma of the change of the walk over the time constant J / l of the default observer, divided by
+        that time constant. With this c, K2 = c J / l covers three sigma of the estimate's error.
+        """
+        density = disturbance_bounds.SIGMAS * np.asarray(self.density)  # pyright: ignore[reportAttributeAccessIssue]
+        time_constant = 1.0 / disturbance_bounds.observer_rate(scenario)
+        return Bounds(density * np.sqrt(scenario.loop.t_end), density / np.sqrt(time_constant))
 
     def build(self, inertia: Any, scenario: Any) -> Any:
         """Return None: the rollout adds the steps of the walk."""
