@@ -130,20 +130,17 @@ def _split_segments(text: str) -> Iterator[Block]:
     yield block
 
 
-def _parse_epoch(block: Block, name: str) -> Epoch:
-    block.get(name)
-    value, line = block.keywords[name]
-    try:
-        return epochs.parse(value)
-    except ValueError as error:
-        raise ValueError(f"line {line}: {name} is {value}, {error}") from None
-
-
-def _usable_interval(block: Block) -> tuple[Epoch, Epoch]:
+def _usable_interval(block: Block) -> list[Epoch]:
     """Return the start and the end of the usable time of a segment."""
-    names = [f"USEABLE_{name}" if f"USEABLE_{name}" in block.keywords else name for name in ("START_TIME", "STOP_TIME")]
-    begin, end = (_parse_epoch(block, name) for name in names)
-    return begin, end
+    ends = []
+    for name in ("START_TIME", "STOP_TIME"):
+        name = f"USEABLE_{name}" if f"USEABLE_{name}" in block.keywords else name
+        value = block.get(name)
+        try:
+            ends.append(epochs.parse(value))
+        except ValueError as error:
+            raise block.error_at(name, str(error)) from None
+    return ends
 
 
 def _check_frames(block: Block) -> None:
@@ -172,29 +169,21 @@ def _parse_data(block: Block) -> tuple[list[Epoch], np.ndarray]:
     kind = block.kind
     if kind not in NUMBERS_PER_LINE:
         raise block.error_at("ATTITUDE_TYPE", f"but must be {' or '.join(NUMBERS_PER_LINE)}: only quaternions are read")
-    times, rows = [], []
+    times, rows, count = [], [], NUMBERS_PER_LINE[kind]
     for line, number in block.data:
         time, *cells = line.split()
         try:
             times.append(epochs.parse(time))
         except ValueError as error:
             raise ValueError(f'line {number}: its time is "{time}", {error}') from None
-        if len(cells) != NUMBERS_PER_LINE[kind]:
-            raise ValueError(f"line {number}: it has {len(cells)} numbers, but {kind} has {NUMBERS_PER_LINE[kind]}")
-        row = [_to_float(cell) for cell in cells]
-        if not np.all(np.isfinite(row)):
-            invalid = cells[int(np.argmin(np.isfinite(row)))]
-            place = f"line {number}, column {cells.index(invalid) + 2}"
-            raise ValueError(f'{place}: it is "{invalid}", but must be a number')
+        try:
+            row = [float(cell) for cell in cells]
+        except ValueError:
+            row = []
+        if len(row) != count or not np.all(np.isfinite(row)):
+            raise ValueError(f'line {number}: it is "{line[:120]}", but must be a time and {count} numbers')
         rows.append(row)
-    return times, np.array(rows).reshape(len(rows), NUMBERS_PER_LINE[kind])
-
-
-def _to_float(cell: str) -> float:
-    try:
-        return float(cell)
-    except ValueError:
-        return np.nan
+    return times, np.array(rows).reshape(len(rows), count)
 
 
 def _convert_attitudes(block: Block, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:

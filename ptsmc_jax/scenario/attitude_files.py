@@ -15,8 +15,12 @@ from ptsmc_jax.scenario.epochs import Epoch
 from ptsmc_jax.signals import attitude_tables
 
 TIME_NAMES = ("t", "time", "time_s", "seconds", "epoch", "utc", "time_utc", "datetime")
-SCALAR_LAST = (("qx", "qy", "qz", "qw"), ("q_x", "q_y", "q_z", "q_w"))  # names that label the scalar part
-SCALAR_FIRST = (("q0", "q1", "q2", "q3"),)
+# names that label the scalar part, with its order
+LABELLED = {
+    ("qx", "qy", "qz", "qw"): "xyzw",
+    ("q_x", "q_y", "q_z", "q_w"): "xyzw",
+    ("q0", "q1", "q2", "q3"): "wxyz",
+}
 UNLABELLED = ("q1", "q2", "q3", "q4")  # names that do not label the scalar part: a key states the order
 RATE_NAMES = (("w1", "w2", "w3"), ("wx", "wy", "wz"), ("w_x", "w_y", "w_z"))
 LARGEST_NORM_ERROR = 1e-3  # allows quaternions with four digits
@@ -70,16 +74,13 @@ def _read_version(
         for key, value in (("quaternion_order", order), ("direction", direction)):
             if value is not None:
                 raise ValueError(f"an attitude ephemeris message, which states its own {key}; allowed is none")
-        segment = aem.read_segment(_read_text(path), start_epoch, any_interpolation=interpolation == "spline")
+        try:
+            text = path.read_text(encoding="utf-8-sig")
+        except (OSError, UnicodeDecodeError):
+            raise ValueError("which is no text in UTF-8; allowed are .csv, .parquet and AEM files (KVN)") from None
+        segment = aem.read_segment(text, start_epoch, any_interpolation=interpolation == "spline")
         times, quaternions, rates, usable_until = segment
     return _check_samples(times, quaternions, rates, min(usable_until, float(times[-1])))
-
-
-def _read_text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError):
-        raise ValueError("which is no text in UTF-8; allowed are .csv, .parquet and AEM files (KVN)") from None
 
 
 def _check_samples(
@@ -151,14 +152,14 @@ def _read_table(
 
 def _quaternion_columns(names: dict[str, str], order: str | None) -> tuple[tuple[str, ...], bool]:
     """Return the columns of the quaternion, and whether the scalar part is the last one."""
-    for group, scalar_last in (*((group, True) for group in SCALAR_LAST), *((group, False) for group in SCALAR_FIRST)):
-        if all(name in names for name in group):
-            if order not in (None, "xyzw" if scalar_last else "wxyz"):
+    for group, labelled_order in LABELLED.items():
+        if names.keys() >= set(group):
+            if order not in (None, labelled_order):
                 raise ValueError(
                     f'whose columns {", ".join(group)} label the scalar part; quaternion_order is "{order}"'
                 )
-            return group, scalar_last
-    if all(name in names for name in UNLABELLED):
+            return group, labelled_order == "xyzw"
+    if names.keys() >= set(UNLABELLED):
         return UNLABELLED, order != "wxyz"
     raise ValueError("which has no quaternion; allowed are the columns q1, q2, q3, q4 or qx, qy, qz, qw or q0 to q3 "
                      "with the scalar q0")  # fmt: skip

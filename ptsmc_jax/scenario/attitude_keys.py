@@ -60,52 +60,51 @@ def quaternion(table: Attitude, name: str) -> np.ndarray:
         unit = unit_quaternion(full_key, value)
         return unit if key == "quat_xyzw" else np.roll(unit, -1)
     with np.errstate(all="ignore"):  # the norm below detects an overflow
-        converted = _convert_rotation(table, name, full_key, np.array(value, dtype=float))
+        converted = _rotation(table, name, key, np.array(value, dtype=float)).as_quat(canonical=True)
     if not abs(np.linalg.norm(converted) - 1.0) < 1e-6:
         raise wrong(full_key, value, "an attitude in numbers whose squares are finite")
     return converted
 
 
-def _convert_rotation(table: Attitude, name: str, full_key: str, array: np.ndarray) -> np.ndarray:
-    """Return the quaternion (4,) of an attitude key that holds another parametrisation."""
+def _rotation(table: Attitude, name: str, key: str, array: np.ndarray) -> Any:
+    """Return the `Rotation` of an attitude key that is no quaternion, from its numbers."""
     from scipy.spatial.transform import Rotation  # the import takes 0.15 s, and most scenarios do not need it
 
-    key = full_key.removeprefix(f"{name}.")
     if key == "rotvec_deg":
-        return Rotation.from_rotvec(array, degrees=True).as_quat(canonical=True)
+        return Rotation.from_rotvec(array, degrees=True)
     if key == "mrp":
-        return Rotation.from_mrp(array).as_quat(canonical=True)
+        return Rotation.from_mrp(array)
     if key == "dcm_body_to_inertial":
         deviation = np.abs(array @ array.T - np.eye(3)).max()
         if not deviation <= 1e-6 or np.linalg.det(array) < 0:
-            raise wrong(full_key, array.tolist(), "a rotation matrix (orthonormal within 1e-6, determinant +1)")
-        return Rotation.from_matrix(array).as_quat(canonical=True)
+            raise wrong(f"{name}.{key}", array.tolist(), "a rotation matrix (orthonormal within 1e-6, determinant +1)")
+        return Rotation.from_matrix(array)
     if table.sequence is None:
         raise ScenarioError(
-            f'{full_key} needs {name}.sequence beside it, three axes in SciPy\'s notation, such as "ZYX"'
+            f'{name}.{key} needs {name}.sequence beside it, three axes in SciPy\'s notation, such as "ZYX"'
         )
     try:
-        return Rotation.from_euler(table.sequence, array, degrees=True).as_quat(canonical=True)
+        return Rotation.from_euler(table.sequence, array, degrees=True)
     except ValueError:
         raise wrong(
             f"{name}.sequence", table.sequence, 'three axes in SciPy\'s notation, such as "ZYX" or "zyx"'
         ) from None
 
 
-def has_attitude(table: Attitude) -> bool:
-    """Whether a table has an attitude key."""
-    return any(getattr(table, key) is not None for key in ATTITUDE_KEYS)
+def stated_keys(table: Attitude) -> list[str]:
+    """Return the attitude keys that a table states."""
+    return [key for key in ATTITUDE_KEYS if getattr(table, key) is not None]
 
 
 def attitude_key(table: Attitude) -> tuple[str, Any]:
     """Return the attitude key that a table uses, and its value."""
-    key = next(key for key in ATTITUDE_KEYS if getattr(table, key) is not None)
+    key, *_ = stated_keys(table)
     return key, getattr(table, key)
 
 
 def check_single_attitude(name: str, table: Any) -> None:
     """Raise ScenarioError if a table has more than one attitude key; `name`: the table's name."""
-    present = [key for key in ATTITUDE_KEYS if getattr(table, key) is not None]
+    present = stated_keys(table)
     if len(present) > 1:
         shown, allowed = " and ".join(present), ", ".join(ATTITUDE_KEYS)
         raise ScenarioError(f"{name} has the attitude keys {shown}, but must have exactly one of {allowed}")

@@ -148,8 +148,8 @@ REFUSED = {
     "interpolation": (message(Q, INTERPOLATION_METHOD="LINEAR"), "INTERPOLATION_METHOD is LINEAR"),
     "version": (message(Q, "3.0"), "line 1: CCSDS_AEM_VERS is 3.0"),
     "another message": ("CIC_AEM_VERS = 1.0\n", "line 1"),
-    "a line of data": (message(Q).replace(DATES[2], DATES[2] + " 0.1"), "line 20: it has 5 numbers"),
-    "a number": (message(Q).replace(f" {Q[1, 1]:.15f}", " 0.x1"), "line 19, column 3"),
+    "a line of data": (message(Q).replace(DATES[2], DATES[2] + " 0.1"), 'line 20: it is "'),
+    "a number": (message(Q).replace(f" {Q[1, 1]:.15f}", " 0.x1"), "must be a time and 4 numbers"),
     "a time": (message(Q).replace(DATES[2], "2026-03-20T24:01:60"), "line 20: its time"),
     "no rate frame": (message(np.hstack([S, RATE]), ATTITUDE_TYPE="QUATERNION/RATE"), "RATE_FRAME"),
     "rates in rad/s": (
