@@ -112,7 +112,7 @@ def field_quantity(
     Args:
         path: path from the parts to a number or an array. If it does not exist, the parts have no such quantity.
         names: names of the columns, or a prefix for numbered names. A scalar has the prefix as its name.
-        default: value if the field is None. None: the parts then have no such quantity.
+        default: value if the field is None, or (parts) -> value. None: the parts then have no such quantity.
         present: (parts) -> whether parts with this field have the quantity.
         **others: further fields of `Quantity`.
     """
@@ -121,7 +121,9 @@ def field_quantity(
         if not paths.exists(parts, path):
             return None
         stored = paths.get(parts, path)
-        return default if stored is None else stored
+        if stored is not None:
+            return stored
+        return default(parts) if callable(default) else default
 
     def columns(parts: Parts) -> list[str]:
         current = value(parts) if present(parts) else None

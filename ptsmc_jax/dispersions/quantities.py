@@ -142,15 +142,6 @@ def _count_channels(parts: Parts) -> int:
     return channel_directions(parts).shape[1] if parts.clock.sampled else 0
 
 
-def _with_actuators(parts: Parts, **changes: Any) -> Parts:
-    return replace(parts, actuators=replace(parts.actuators, **changes))
-
-
-def _read_scale(parts: Parts) -> Numbers:
-    scale = parts.actuators.scale
-    return jnp.ones(_count_channels(parts)) if scale is None else scale
-
-
 def _read_directions(parts: Parts) -> Numbers:
     """Return the true directions of the channels, one after another, (3 channels,) [-]."""
     directions = parts.actuators.directions
@@ -175,7 +166,7 @@ def _read_wheel_failure(parts: Parts) -> Numbers:
 
 def _with_wheel_failure(parts: Parts, failure: Numbers) -> Parts:
     wheel = jnp.arange(channel_directions(parts).shape[1]).astype(float) + 1.0
-    return _with_actuators(parts, failure_times=jnp.where(wheel == failure[1], failure[0], jnp.inf))
+    return paths.put(parts, "actuators.failure_times", jnp.where(wheel == failure[1], failure[0], jnp.inf))
 
 
 def _random_wheel_failure(random: Random, nominal: Numbers, parts: Parts) -> Numbers:
@@ -257,17 +248,18 @@ QUANTITIES: dict[str, Quantity] = {
     },
     # gyro bias at the first sample; without a value in a run table, the sensors have a random bias
     RATE_BIAS: field_quantity("sensors.given_bias", f"{RATE_BIAS}_", np.zeros(3), unit="rad/s"),
-    "actuator_scale": Quantity(
-        lambda parts: number_names("actuator_scale_", _count_channels(parts)),
-        _read_scale,
-        lambda parts, scale: _with_actuators(parts, scale=scale),
-        scale_nominal,
+    "actuator_scale": field_quantity(
+        "actuators.scale",
+        "actuator_scale_",
+        lambda parts: jnp.ones(_count_channels(parts)),
+        lambda parts: parts.clock.sampled,
+        combine=scale_nominal,
         hardware=True,
     ),
     "actuator_misalignment": Quantity(
         lambda parts: _vector_columns("actuator_misalignment", _count_channels(parts)),
         _read_directions,
-        lambda parts, directions: _with_actuators(parts, directions=directions.reshape(-1, 3).T),
+        lambda parts, directions: paths.put(parts, "actuators.directions", directions.reshape(-1, 3).T),
         _rotate_channels,
         validate=validator(
             lambda rows: np.abs(np.linalg.norm(rows.reshape(len(rows), -1, 3), axis=2) - 1.0) <= NORM_TOLERANCE,

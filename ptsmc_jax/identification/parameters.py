@@ -353,7 +353,7 @@ def _parameter_makers(
         ("disturbance_phase", "rad", "add"),
     ):
         quantity: Any = name.removeprefix("disturbance_")
-        count = disturbances.count_values(model.disturbance, quantity)
+        count = disturbances.values(model.disturbance, quantity).size
         if count:
             makers[name] = parameter_maker(
                 name,

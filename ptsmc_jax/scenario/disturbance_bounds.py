@@ -163,14 +163,12 @@ def path_bounds(scenario: Any, signal: Any, fastest: float = 0.0) -> Bounds:
 def _extreme_disturbances(scenario: Any, signal: Any) -> list[Any]:
     """Return a custom disturbance with the smallest and the largest random amplitudes, at `PHASE_COUNT` phases."""
     extremes, largest = [signal], largest_factor(scenario)
-    if largest != 1.0 and disturbances.count_values(signal, "amplitude"):
-        amplitudes = disturbances.values(signal, "amplitude")
+    amplitudes, phases = disturbances.values(signal, "amplitude"), disturbances.values(signal, "phase")
+    if largest != 1.0 and amplitudes.size:
         extremes = [disturbances.with_values(signal, "amplitude", amplitudes * k) for k in (largest, 2.0 - largest)]
-    if getattr(scenario.dispersion, "disturbance_phase", None) is None or not disturbances.count_values(
-        signal, "phase"
-    ):
+    if getattr(scenario.dispersion, "disturbance_phase", None) is None or not phases.size:
         return extremes
-    angles, phases = np.linspace(0.0, 2.0 * np.pi, PHASE_COUNT, endpoint=False), disturbances.values(signal, "phase")
+    angles = np.linspace(0.0, 2.0 * np.pi, PHASE_COUNT, endpoint=False)
     return [disturbances.with_values(one, "phase", phases + angle) for one in extremes for angle in angles]
 
 

@@ -215,20 +215,11 @@ def _field_name(term: Any, quantity: str) -> str | None:
     return getattr(term, "drawn", {}).get(quantity)
 
 
-def _field_values(disturbance: Any, quantity: str) -> list[Any]:
-    """Return the phases or amplitudes of each term that has them."""
-    fields = ((term, _field_name(term, quantity)) for term in terms(disturbance))
-    return [getattr(term, field) for term, field in fields if field is not None]
-
-
-def count_values(disturbance: Any, quantity: Literal["phase", "amplitude"]) -> int:
-    """Return the number of phases or amplitudes of a disturbance."""
-    return sum(map(np.size, _field_values(disturbance, quantity)))
-
-
 def values(disturbance: Any, quantity: Literal["phase", "amplitude"]) -> Float[Array, " count"]:
     """Return all phases [rad] or amplitudes [N m] of a disturbance, (count,), in the order of terms and inputs."""
-    return jnp.concatenate([jnp.zeros(0), *map(jnp.ravel, _field_values(disturbance, quantity))])
+    fields = ((term, _field_name(term, quantity)) for term in terms(disturbance))
+    found = [jnp.ravel(getattr(term, field)) for term, field in fields if field is not None]
+    return jnp.concatenate([jnp.zeros(0), *found])
 
 
 def with_values(disturbance: Any, quantity: Literal["phase", "amplitude"], new_values: Float[Array, " count"]) -> Any:
