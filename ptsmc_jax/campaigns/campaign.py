@@ -20,11 +20,9 @@ from ptsmc_jax.campaigns.montecarlo import CustomMetrics
 from ptsmc_jax.campaigns.rows import Part, Rows, read
 from ptsmc_jax.campaigns.run_tables import RunTable
 from ptsmc_jax.devices.sensors import RATE_BIAS
-from ptsmc_jax.dispersions import table_rows
 from ptsmc_jax.dispersions.base import CUSTOM
 from ptsmc_jax.dispersions.quantities import QUANTITIES
-from ptsmc_jax.dispersions.table_rows import Row
-from ptsmc_jax.dispersions.variation import Dispersion
+from ptsmc_jax.dispersions.variation import Dispersion, Row, trial_setup
 from ptsmc_jax.scenario import Study, custom_checks
 from ptsmc_jax.simulation import requirements, rollout
 from ptsmc_jax.simulation.computer import PYTHON_SOFTWARE, Software
@@ -289,7 +287,7 @@ def _simulate_error_history(
     parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Array | Row, software: Software
 ) -> tuple:
     def simulate_one(trial: jax.Array | Row) -> tuple:
-        trial_parts = table_rows.trial_setup(parts, dispersion, seed, trial)
+        trial_parts = trial_setup(parts, dispersion, seed, trial)
         log = rollout.simulate(
             trial_parts.dispersed_parts, trial_parts.seed, trial_parts.trial, record=True, software=software
         ).log

@@ -12,11 +12,9 @@ from numpy.typing import ArrayLike
 from ptsmc_jax import configure, programs
 from ptsmc_jax.batching import lanes, lapack
 from ptsmc_jax.campaigns import montecarlo
-from ptsmc_jax.dispersions import table_rows
 from ptsmc_jax.dispersions.base import CUSTOM, INERTIA, INITIAL_ATTITUDE, INITIAL_RATE, INITIAL_STATE, REFERENCE
 from ptsmc_jax.dispersions.quantities import QUANTITIES
-from ptsmc_jax.dispersions.table_rows import Row
-from ptsmc_jax.dispersions.variation import Dispersion
+from ptsmc_jax.dispersions.variation import Dispersion, Row, trial_setup
 from ptsmc_jax.scenario import Study
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.catalogues import MARGINS
@@ -190,7 +188,7 @@ def _loops_and_margins(
         return {name: _worst_value(name, v) for name, v in margins.estimate(loop).items()}
 
     def simulate_trial(trial: Array | Row) -> tuple[Parts, linear.NominalRun]:
-        drawn = table_rows.trial_setup(parts, dispersion, seed, trial).dispersed_parts
+        drawn = trial_setup(parts, dispersion, seed, trial).dispersed_parts
         return drawn, linear.simulate_nominal(drawn)
 
     def loops_of_trial(drawn: Parts, run: linear.NominalRun) -> linear.Loop:

@@ -14,10 +14,8 @@ from numpy.typing import ArrayLike
 from ptsmc_jax import configure, programs
 from ptsmc_jax.batching import lanes
 from ptsmc_jax.devices.sensors import RATE_BIAS
-from ptsmc_jax.dispersions import table_rows
 from ptsmc_jax.dispersions.base import CUSTOM, Coordinates
-from ptsmc_jax.dispersions.table_rows import Row
-from ptsmc_jax.dispersions.variation import Dispersion, check_dispersion
+from ptsmc_jax.dispersions.variation import Dispersion, Row, TrialSetup, check_dispersion, trial_setup
 from ptsmc_jax.numerics.draws import WholeNumber, check_whole_number
 from ptsmc_jax.numerics.pytrees import listing
 from ptsmc_jax.simulation import rollout
@@ -114,7 +112,7 @@ def one(
     """
     check_parts(parts)
     check_dispersion(dispersion)
-    trial_parts = table_rows.trial_setup(parts, dispersion, seed, trial)
+    trial_parts = trial_setup(parts, dispersion, seed, trial)
     if coordinates is None:
         coordinates = trial_parts.dispersion.coordinates(trial_parts.seed, trial_parts.trial)
     drawn = trial_parts.dispersion.at(trial_parts.parts, coordinates)
@@ -134,7 +132,7 @@ def coordinates(dispersion: Dispersion, seed: jax.Array, trials: jax.Array) -> C
 
 def values(parts: Parts, dispersion: Dispersion, seed: WholeNumber, trial: WholeNumber | Row) -> dict[str, jax.Array]:
     """Return the dispersed quantities of a trial by name, without simulating it; arguments as for `one`."""
-    trial_parts = table_rows.trial_setup(parts, dispersion, seed, trial)
+    trial_parts = trial_setup(parts, dispersion, seed, trial)
     coordinates = trial_parts.dispersion.coordinates(trial_parts.seed, trial_parts.trial)
     return _read_dispersed_values(
         dispersion, trial_parts.dispersion.at(trial_parts.parts, coordinates), trial_parts, coordinates
@@ -142,7 +140,7 @@ def values(parts: Parts, dispersion: Dispersion, seed: WholeNumber, trial: Whole
 
 
 def _read_dispersed_values(
-    dispersion: Dispersion, drawn: Parts, trial_parts: table_rows.TrialSetup, coordinates: Coordinates
+    dispersion: Dispersion, drawn: Parts, trial_parts: TrialSetup, coordinates: Coordinates
 ) -> dict[str, jax.Array]:
     """Return the dispersed quantities of a trial, its gyro bias, and the numbers of custom dispersions, by column.
 

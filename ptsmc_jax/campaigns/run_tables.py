@@ -16,7 +16,7 @@ import polars as pl
 
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.dispersions.quantities import QUANTITIES, UnfitError
-from ptsmc_jax.dispersions.table_rows import RESULT_COLUMNS, SEED, TRIAL, Row
+from ptsmc_jax.dispersions.variation import RESULT_COLUMNS, SEED, TRIAL, Row
 from ptsmc_jax.numerics import csv_tables
 from ptsmc_jax.scenario import parsing
 from ptsmc_jax.simulation import computer

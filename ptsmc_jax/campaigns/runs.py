@@ -11,9 +11,7 @@ from numpy.typing import ArrayLike
 
 from ptsmc_jax import programs
 from ptsmc_jax.campaigns import margin_verdicts, montecarlo
-from ptsmc_jax.dispersions import table_rows
-from ptsmc_jax.dispersions.table_rows import Row
-from ptsmc_jax.dispersions.variation import Dispersion
+from ptsmc_jax.dispersions.variation import Dispersion, Row, trial_setup
 from ptsmc_jax.scenario import Study
 from ptsmc_jax.simulation import requirements, rollout
 from ptsmc_jax.simulation.catalogues import Entry
@@ -158,7 +156,7 @@ def prepare(ready: Study) -> None:
 
 @programs.jit
 def _dispersed_parts(dispersion: Dispersion, parts: Parts, seed: jax.Array, trial: jax.Array | Row) -> Parts:
-    return table_rows.trial_setup(parts, dispersion, seed, trial).dispersed_parts
+    return trial_setup(parts, dispersion, seed, trial).dispersed_parts
 
 
 def rms_lower_bound(ready: Study, seed: int = 0, rows: Sequence[int | Row] = ()) -> float | None:

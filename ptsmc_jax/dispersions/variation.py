@@ -1,10 +1,12 @@
 """The dispersion of a campaign: parts of a trial as a pure function of nominal parts, seed and trial number.
 
-Read `Dispersion.apply` first.
+Read `Dispersion.apply` first. In trials of a run table, quantities with a column have the values of the table, and all
+others are random: `trial_setup` combines a row of the table with the dispersion of the campaign.
 """
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +29,10 @@ from ptsmc_jax.numerics import draws, paths
 from ptsmc_jax.numerics.draws import WholeNumber
 from ptsmc_jax.numerics.pytrees import pytree
 from ptsmc_jax.simulation.rollout import Parts
+
+TRIAL, SEED = "trial", "seed"  # columns of a run table that select the random numbers of a row
+# names of these columns in result files, where `trial` is the number of the row
+RESULT_COLUMNS = {TRIAL: "run_trial", SEED: "run_seed"}
 
 
 def check_dispersion(value: object) -> None:
@@ -122,3 +128,44 @@ class Dispersion:
     def without(self, names: Iterable[str]) -> "Dispersion":
         """Return the dispersion without these quantities. The random numbers of all others do not change."""
         return replace(self, numbers={name: kind for name, kind in self.numbers.items() if name not in names})
+
+
+class Row(NamedTuple):
+    """A row of a run table, or several rows with a leading axis."""
+
+    seed: Any  # integer that selects the random numbers, together with `trial`
+    trial: Any  # integer
+    given: dict[str, Any]  # given values (n,) by the name of the quantity, see `QUANTITIES`
+
+
+class TrialSetup(NamedTuple):
+    """Everything that determines the parts of a trial."""
+
+    parts: Parts  # nominal parts, with the given values of the row
+    dispersion: Dispersion  # of the quantities that are not given
+    seed: WholeNumber
+    trial: Any
+    given: tuple[str, ...]  # names of the quantities with given values
+
+    @property
+    def dispersed_parts(self) -> Parts:
+        """Parts of the trial, with random and given values."""
+        return self.dispersion.apply(self.parts, self.seed, self.trial)
+
+
+def trial_setup(parts: Parts, dispersion: Dispersion, seed: WholeNumber, trial: WholeNumber | Row) -> TrialSetup:
+    """Write the given values of a row into the parts, and remove these quantities from the dispersion.
+
+    Each quantity has its own random stream. Therefore the given values do not change the random quantities.
+
+    Args:
+        parts: nominal parts.
+        dispersion: dispersion of the campaign.
+        seed: seed of the campaign [-]; a row has its own seed.
+        trial: number of the trial [-], or a row of a run table with values in SI units.
+    """
+    if not isinstance(trial, Row):
+        return TrialSetup(parts, dispersion, seed, trial, ())
+    for name, numbers in trial.given.items():
+        parts = QUANTITIES[name].write(parts, numbers)
+    return TrialSetup(parts, dispersion.without(trial.given), trial.seed, trial.trial, tuple(trial.given))

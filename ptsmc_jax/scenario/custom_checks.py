@@ -12,8 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ptsmc_jax.dispersions.table_rows import RESULT_COLUMNS
-from ptsmc_jax.dispersions.variation import Dispersion
+from ptsmc_jax.dispersions.variation import RESULT_COLUMNS, Dispersion
 from ptsmc_jax.laws.base import Law, Sample
 from ptsmc_jax.observers.base import Bound
 from ptsmc_jax.plants.base import check_indices

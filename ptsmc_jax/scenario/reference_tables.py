@@ -18,7 +18,7 @@ from ptsmc_jax.scenario.custom import Custom, custom_kind, fastest_rate
 from ptsmc_jax.scenario.errors import ScenarioError, show, value_error, wrong
 from ptsmc_jax.scenario.schema import PartTable, make_table
 from ptsmc_jax.scenario.values import Four, Kinds, Meaning, Number, Three
-from ptsmc_jax.signals import attitude_tables, mission_references, orbits, references
+from ptsmc_jax.signals import attitude_tables, orbits, references
 
 Vector = Annotated[
     Literal["nadir", "velocity", "orbit_normal", "sun"] | tuple[float, float, float],
@@ -235,7 +235,7 @@ class MissionTable(ReferenceTable, frozen=True):
     @property
     def mount(self) -> np.ndarray:
         """Quaternion (4,) from body axes to the axes of the frame."""
-        return mission_references.mounting(self.primary_axis, self.secondary_axis)
+        return orbits.mounting(self.primary_axis, self.secondary_axis)
 
     def check(self, scenario: Any) -> None:
         _check_axis("reference.primary_axis", self.primary_axis)
@@ -268,7 +268,7 @@ class NadirTable(MissionTable, frozen=True):
 
     @property
     def mount(self) -> np.ndarray:
-        return mission_references.nadir_mounting(self.primary_axis, self.secondary_axis)
+        return orbits.nadir_mounting(self.primary_axis, self.secondary_axis)
 
     def build(self, scenario: Any) -> Any:
         return jax.tree.map(vector, self.part_class(q=IDENTITY, mount=self.mount, orbit=self._orbit(scenario)))
@@ -354,7 +354,7 @@ def _sample(table: Any, mission: Mission) -> SampledReference:
     rates = turns[: anchor_count // run_lengths] / step
     fastest = np.linalg.norm(rates, axis=1).max() + np.sqrt(np.linalg.norm(np.diff(rates, axis=0), axis=1).max() / step)
     span = run_lengths * mission.end
-    return SampledReference(mission_references.anchor_quaternions(matrices), span, float(fastest), matrices[0])
+    return SampledReference(orbits.anchor_quaternions(matrices), span, float(fastest), matrices[0])
 
 
 SECONDARY = Meaning("direction of `secondary_axis`: a name, or three numbers in inertial axes")
@@ -409,9 +409,9 @@ REFERENCES: Kinds = {
     "sinusoid": make_table(AttitudeReference, references.Swing, "sinusoid"),
     "slew": make_table(SlewTable, references.Slew, "slew"),
     "table": make_table(FileReference, attitude_tables.TableReference, "table"),
-    "nadir": make_table(NadirTable, mission_references.NadirReference, "nadir"),
-    "ground_target": make_table(GroundTargetTable, mission_references.GroundTargetReference, "ground_target"),
-    "two_vector": make_table(TwoVectorTable, mission_references.TwoVectorReference, "two_vector"),
+    "nadir": make_table(NadirTable, orbits.NadirReference, "nadir"),
+    "ground_target": make_table(GroundTargetTable, orbits.GroundTargetReference, "ground_target"),
+    "two_vector": make_table(TwoVectorTable, orbits.TwoVectorReference, "two_vector"),
     "custom": custom_kind(
         AttitudeReference, references.Reference, ("attitude",),
         "A custom reference, a class derived from ptsmc_jax.Reference; its fields are further keys.",

@@ -16,7 +16,7 @@ from ptsmc_jax.batching import lanes, lapack
 from ptsmc_jax.plants.rigid_body import AttitudeState
 from ptsmc_jax.scenario import epochs, plausibility
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.signals import mission_references, orbits
+from ptsmc_jax.signals import orbits
 from tests.helpers import refuses
 
 MU, EARTH_RATE = 3.986004418e14, 7.292115e-5
@@ -202,7 +202,7 @@ def test_kepler_equation_and_its_derivatives(eccentricity):
     np.testing.assert_allclose(radius, p / (1.0 + e * np.cos(f)), rtol=1e-11)
     assert np.all(np.diff(f) > 0.0)
     # Kepler's second law and its derivative: f' = h / r^2, f'' = -2 r' h / r^3
-    targets = lapack.vmap(mission_references.NadirReference(
+    targets = lapack.vmap(orbits.NadirReference(
         jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.array([0.0, 0.0, 0.0, 1.0]), orbit))(jnp.asarray(times))  # fmt: skip
     h = np.sqrt(MU * p)
     np.testing.assert_allclose(targets.w[:, 2], h / radius**2, rtol=1e-11)

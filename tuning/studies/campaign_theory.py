@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ptsmc_jax.campaigns import margin_verdicts, runs, store
-from ptsmc_jax.dispersions.table_rows import Row
+from ptsmc_jax.dispersions.variation import Row
 from ptsmc_jax.simulation import catalogues
 from tuning.studies.campaign_folder import THEORY, Folder
 
