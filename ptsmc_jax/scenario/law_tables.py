@@ -12,7 +12,7 @@ import msgspec
 from ptsmc_jax.laws import baselines, kinematics, prescribed_time, time_base
 from ptsmc_jax.laws.base import AccelerationLaw
 from ptsmc_jax.numerics.pytrees import vector
-from ptsmc_jax.scenario import disturbance_bounds, mission
+from ptsmc_jax.scenario import disturbance_tables, mission
 from ptsmc_jax.scenario.custom import custom_kind
 from ptsmc_jax.scenario.errors import show, wrong
 from ptsmc_jax.scenario.schema import PartTable, make_table
@@ -79,7 +79,7 @@ class LawTable(PartTable, frozen=True):
         The gains are designed for the sampled loop. If the loop is continuous or the scenario is a published case, they
         are the published gains, scaled to the mission.
         """
-        bounds = disturbance_bounds.compute(scenario)
+        bounds = disturbance_tables.largest_disturbance(scenario)
         if bounds is not None:
             self = self._fill_absent(dict(zip(("disturbance_bound", "disturbance_rate_bound"), bounds, strict=True)))
         filled = self

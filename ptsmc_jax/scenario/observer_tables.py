@@ -12,7 +12,7 @@ import msgspec
 from ptsmc_jax.declare import Scaled
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.observers import base, finite_time, none, nonlinear, prescribed_time
-from ptsmc_jax.scenario import disturbance_bounds, mission
+from ptsmc_jax.scenario import disturbance_tables, mission
 from ptsmc_jax.scenario.custom import Custom, custom_kind
 from ptsmc_jax.scenario.errors import wrong
 from ptsmc_jax.scenario.schema import PartTable, make_table
@@ -49,7 +49,7 @@ class LinearTable(ObserverTable, frozen=True):
         """Fill an absent gain, equal on all axes: the published one, scaled, or a design for the sampled loop."""
         if self.gain is not None:  # pyright: ignore[reportAttributeAccessIssue]
             return self
-        gain = disturbance_bounds.observer_gain(scenario)
+        gain = disturbance_tables.observer_gain(scenario)
         if scenario.sampled and not mission.is_published_case(scenario):
             gain = mission.design(scenario).observer
         return msgspec.structs.replace(self, gain=(gain,) * scenario.inputs)

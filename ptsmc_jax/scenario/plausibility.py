@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ptsmc_jax.scenario import disturbance_bounds, errors
+from ptsmc_jax.scenario import disturbance_tables, errors
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.theory import stability_limits
 
@@ -24,7 +24,7 @@ def warnings(scenario: Scenario) -> list[str]:
 
     Bounds and estimate are not examined if custom code that defines the disturbance has not run yet.
     """
-    bounds = disturbance_bounds.compute(scenario)
+    bounds = disturbance_tables.largest_disturbance(scenario)
     bound_warnings = (
         [] if bounds is None else [*_implausible_bound(scenario, *bounds), *_noisy_estimate(scenario, bounds[0])]
     )

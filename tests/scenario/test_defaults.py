@@ -12,7 +12,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.observers.nonlinear import NonlinearObserver
 from ptsmc_jax.plants import rigid_body
-from ptsmc_jax.scenario import disturbance_bounds, free_gains, parsing, plausibility, reading
+from ptsmc_jax.scenario import disturbance_tables, free_gains, parsing, plausibility, reading
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.signals.disturbances import Disturbance
 from tests.helpers import FULL_INERTIA
@@ -323,7 +323,7 @@ class Vibration(Disturbance):
 def test_bounds_of_a_fast_custom_disturbance_are_not_aliased(rate):
     """An earlier version aliased a disturbance of 25 Hz with its sample times and found bounds of nearly zero."""
     said = scenario.from_tables({"disturbance": {"kind": "custom", "code": Vibration, "rate": rate}})
-    known = disturbance_bounds.compute(said)
+    known = disturbance_tables.largest_disturbance(said)
     assert known is not None
     np.testing.assert_allclose(known, (0.01, 0.01 * rate), rtol=3e-3)
 
@@ -351,7 +351,7 @@ class Swell(Disturbance):
 )
 def test_bounds_of_a_custom_disturbance_include_dispersions(drawn, most):
     dispersion = {"dispersion": drawn} if drawn else {}
-    known = disturbance_bounds.compute(
+    known = disturbance_tables.largest_disturbance(
         scenario.from_tables({"disturbance": {"kind": "custom", "code": Swell}, **dispersion})
     )
     assert known is not None

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from ptsmc_jax import scenario as scenarios
-from ptsmc_jax.scenario import disturbance_bounds, keys, mission
+from ptsmc_jax.scenario import disturbance_tables, keys, mission
 from ptsmc_jax.scenario.device_tables import COMMAND_FILTERS, FILTERS
 from ptsmc_jax.scenario.law_tables import LAWS, common_keys
 from ptsmc_jax.scenario.layouts import SCENARIOS
@@ -68,7 +68,7 @@ def published_gains(scenario: Scenario) -> dict[str, float]:
         gains["delta"] = max(gains["delta"], scenario.loop.period)
     if scenario.motion == "chain":
         gains["eta"] = scenario.order + 1.0
-    observer_gain = disturbance_bounds.observer_gain(scenario)
+    observer_gain = disturbance_tables.observer_gain(scenario)
     return gains | ({"observer_gain": observer_gain} if scenario.observer.kind == "nonlinear" else {})
 
 
