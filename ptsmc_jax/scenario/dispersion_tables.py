@@ -202,6 +202,11 @@ class RelativeInertia(Table, frozen=True):
     std: Annotated[SmallFraction, Meaning("relative standard deviation")] = 0.05
     axes_deg: Annotated[NotNegative, Meaning("1 sigma of the small rotation of the principal axes", "deg")] = 0.0
 
+    @property
+    def largest(self) -> float:
+        """The largest relative deviation of a moment that bounds assume, three sigma."""
+        return 3.0 * self.std
+
     def build(self, parts: Any, count: int) -> Any:
         """Return `dispersions.inertias.RelativeInertia` about the inertia of the true body."""
         moments, axes = np.linalg.eigh(np.asarray(parts.plant.inertia))
@@ -229,6 +234,14 @@ class CorrelatedInertia(Table, frozen=True):
         ],
         Meaning("lower triangular factor A of the covariance A A' of the coordinates, by rows"),
     ] = tuple((0.0,) * k for k in range(1, 7))  # pyright: ignore[reportAssignmentType]
+
+    @property
+    def largest(self) -> float:
+        """The largest relative deviation of a moment that bounds assume, three sigma.
+
+        Coordinates c change a moment by at most 2 |c| of it, to first order.
+        """
+        return 6.0 * float(np.linalg.norm(self.matrix(), 2))
 
     def matrix(self) -> np.ndarray:
         """Return the factor (6, 6) [-]."""

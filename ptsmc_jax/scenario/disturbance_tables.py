@@ -176,7 +176,7 @@ class GravityTable(Attitude, DisturbanceTable, frozen=True):
         inertia = np.asarray(scenario.true_inertia, dtype=float)
         moments = np.sort(inertia) if inertia.ndim == 1 else np.linalg.eigvalsh(inertia)
         inertia_dispersion = getattr(scenario.dispersion, "inertia", None)
-        deviation = 0.0 if inertia_dispersion is None else SIGMAS * inertia_dispersion.std
+        deviation = 0.0 if inertia_dispersion is None else inertia_dispersion.largest
         moment_difference = moments[2] * (1.0 + deviation) - moments[0] * (1.0 - deviation)
         factor = 3.0 * rate * rate * moment_difference / (1.0 - e) ** 3
         perigee_rate = rate * math.sqrt(1.0 + e) / (1.0 - e) ** 1.5

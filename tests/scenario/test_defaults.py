@@ -102,6 +102,18 @@ def test_independent_random_walks_add_up_by_their_squares():
     np.testing.assert_allclose(walking(one, other), walking(both), rtol=1e-12)
 
 
+def test_bounds_of_the_gravity_gradient_include_correlated_inertias():
+    """The dispersion that `ptsmc identify` writes, at three sigma in every direction of its six coordinates."""
+    dispersion = {"inertia": {"kind": "correlated", "factor": [[0.01] * k for k in range(1, 7)]}}
+    tables = {"disturbance": {"kind": "gravity_gradient", "orbit_rate": 1e-3}, "dispersion": dispersion}
+    kind = scenario.study(scenario.from_tables(tables)).dispersion.numbers["inertia"]
+    directions = np.random.default_rng(1).normal(size=(500, 6))
+    directions *= 3.0 / np.linalg.norm(directions, axis=1, keepdims=True)
+    moments = np.linalg.eigvalsh(np.stack([kind.at(jnp.asarray(c))[0] for c in directions]))
+    largest = 1.5e-6 * np.max(moments[:, 2] - moments[:, 0])
+    assert 0.3 * bounds(**tables)[0] < largest <= bounds(**tables)[0]
+
+
 def test_bounds_of_the_gravity_gradient_are_tight():
     """The largest c x J c is half the difference of the moments, and its rate is at most the difference times |c'|."""
     n, inertia = 1.1e-3, np.asarray(FULL_INERTIA)
