@@ -22,8 +22,7 @@ from ptsmc_jax.dispersions import variation
 from ptsmc_jax.laws.kinematics import ChainKinematics
 from ptsmc_jax.plants import integrator_chain, rigid_body
 from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES
-from ptsmc_jax.scenario.law_tables import BASELINES, LAWS
-from ptsmc_jax.scenario.observer_tables import OBSERVERS
+from ptsmc_jax.scenario.law_tables import BASELINES, LAWS, OBSERVERS
 from ptsmc_jax.scenario.reference_tables import REFERENCES
 from ptsmc_jax.signals import references
 from ptsmc_jax.simulation import rollout

@@ -17,8 +17,7 @@ from ptsmc_jax.scenario import attitude_keys, device_tables, dispersion_tables, 
 from ptsmc_jax.scenario.custom_devices import SENSORS
 from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES, SIGMAS
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
-from ptsmc_jax.scenario.law_tables import LAWS
-from ptsmc_jax.scenario.observer_tables import OBSERVERS
+from ptsmc_jax.scenario.law_tables import LAWS, OBSERVERS
 from ptsmc_jax.scenario.reference_tables import ORBITS, REFERENCES, Initial, OrbitTable
 from ptsmc_jax.scenario.sensor_tables import SensorSuite
 from ptsmc_jax.scenario.tables import Loop, Scenario, Tune

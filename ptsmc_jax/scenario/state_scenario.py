@@ -16,8 +16,7 @@ from ptsmc_jax.scenario import device_tables, dispersion_tables, errors, identif
 from ptsmc_jax.scenario.custom_devices import SENSORS
 from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
-from ptsmc_jax.scenario.law_tables import LAWS
-from ptsmc_jax.scenario.observer_tables import OBSERVERS
+from ptsmc_jax.scenario.law_tables import LAWS, OBSERVERS
 from ptsmc_jax.scenario.tables import Loop, Scenario, Tune
 from ptsmc_jax.scenario.values import Kinds, Meaning, Numbers, Table
 from ptsmc_jax.signals.references import CurrentTime, Origin

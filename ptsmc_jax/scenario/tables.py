@@ -222,7 +222,7 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
     # the classes of these tables by kind are in `TABLES`
     disturbance: Any  # `disturbance_tables.DisturbanceTable`, or several
     controller: Any  # `law_tables.LawTable`
-    observer: Any  # `observer_tables.ObserverTable`
+    observer: Any  # `law_tables.ObserverTable`
     loop: Loop
     hardware: Any = None  # `device_tables.Actuators`
     sensors: Any = None  # `custom_devices.SensorTable` or `sensor_tables.SensorSuite`

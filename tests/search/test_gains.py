@@ -15,8 +15,7 @@ from ptsmc_jax.numerics.pytrees import pytree
 from ptsmc_jax.scenario import free_gains, from_tables, gain_bounds, study, timing
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.gain_bounds import BoundsContext
-from ptsmc_jax.scenario.law_tables import LAWS
-from ptsmc_jax.scenario.observer_tables import OBSERVERS
+from ptsmc_jax.scenario.law_tables import LAWS, OBSERVERS
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import stability_limits
 from tests.helpers import FIRST_FLIGHT, finer, short, ticks_of, vector
