@@ -7,7 +7,6 @@ package, from body to inertial axes.
 
 import datetime as dt
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -70,7 +69,7 @@ def read_segment(text: str, start_epoch: Epoch | None = None, *, any_interpolati
         ValueError: the message is damaged, or it has content that cannot be a reference. The message of the error names
             line and keyword.
     """
-    blocks = list(_split_segments(text))
+    blocks = _split_segments(text)
     if start_epoch is None:
         block = blocks[0]
     else:
@@ -94,40 +93,33 @@ def read_segment(text: str, start_epoch: Epoch | None = None, *, any_interpolati
     return Segment(np.array([time.since(start_epoch) for time in times]), quaternions, rates, end.since(start_epoch))
 
 
-def _split_segments(text: str) -> Iterator[Block]:
-    """Yield the segments of an attitude ephemeris message, each with its keywords and data lines."""
-    block, section, has_version = None, "", False
-    for number, line in enumerate(text.splitlines(), 1):
-        line = line.strip()
-        if not line or line.startswith("COMMENT"):
-            continue
+def _split_segments(text: str) -> list[Block]:
+    """Return the segments of an attitude ephemeris message, each with its keywords and data lines."""
+    lines = [(line.strip(), number) for number, line in enumerate(text.splitlines(), 1)]
+    lines = [(line, number) for line, number in lines if line and not line.startswith("COMMENT")]
+    first, number = lines[0] if lines else ("", 1)
+    if "".join(first.split()) not in [f"CCSDS_AEM_VERS={version}" for version in VERSIONS]:
+        raise ValueError(
+            f'line {number}: it is "{first[:40]}", but an attitude ephemeris message (AEM) in keyword-value notation '
+            f"must begin with CCSDS_AEM_VERS = {' or '.join(VERSIONS)}"
+        )
+    blocks, in_data = [], False
+    for line, number in lines[1:]:
         name, equals, value = (part.strip() for part in line.partition("="))
-        if not has_version:
-            if name != "CCSDS_AEM_VERS":
-                raise ValueError(f'line {number}: it is "{line[:40]}", but the first keyword of an attitude ephemeris '
-                                 "message (AEM) in keyword-value notation must be CCSDS_AEM_VERS")  # fmt: skip
-            if value not in VERSIONS:
-                raise ValueError(f"line {number}: CCSDS_AEM_VERS is {value}, but must be {' or '.join(VERSIONS)}")
-            has_version = True
-        elif line == "META_START":
-            if block is not None:
-                yield block
-            block, section = Block(), "META"
-        elif line == "META_STOP":
-            section = "DATA"
-        elif line in ("DATA_START", "DATA_STOP"):
-            if section != "DATA":
-                raise ValueError(f"line {number}: {line} is not after META_STOP")
-        elif section == "DATA":
-            assert block is not None
-            block.data.append((line, number))
-        elif section == "META" and block is not None and equals:
-            block.keywords[name] = value, number
-        elif not equals:
+        if line == "META_START":
+            blocks.append(Block())
+            in_data = False
+        elif line == "META_STOP" and blocks:
+            in_data = True
+        elif in_data and line not in ("DATA_START", "DATA_STOP"):
+            blocks[-1].data.append((line, number))
+        elif not in_data and not equals:
             raise ValueError(f'line {number}: it is "{line[:40]}", but must be a keyword, = and its value')
-    if block is None or section != "DATA":
+        elif not in_data and blocks:
+            blocks[-1].keywords[name] = value, number
+    if not in_data:
         raise ValueError("the message has no complete segment from META_START to META_STOP")
-    yield block
+    return blocks
 
 
 def _usable_interval(block: Block) -> list[Epoch]:

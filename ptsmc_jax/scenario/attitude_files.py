@@ -18,11 +18,10 @@ TIME_NAMES = ("t", "time", "time_s", "seconds", "epoch", "utc", "time_utc", "dat
 # names that label the scalar part, with its order
 LABELLED = {
     ("qx", "qy", "qz", "qw"): "xyzw",
-    ("q_x", "q_y", "q_z", "q_w"): "xyzw",
     ("q0", "q1", "q2", "q3"): "wxyz",
 }
 UNLABELLED = ("q1", "q2", "q3", "q4")  # names that do not label the scalar part: a key states the order
-RATE_NAMES = (("w1", "w2", "w3"), ("wx", "wy", "wz"), ("w_x", "w_y", "w_z"))
+RATE_NAMES = (("w1", "w2", "w3"), ("wx", "wy", "wz"))
 LARGEST_NORM_ERROR = 1e-3  # allows quaternions with four digits
 LARGEST_RATE_ERROR = 0.1  # largest allowed difference of rates / largest rate
 MOST_SAMPLES = 100_000
@@ -57,8 +56,6 @@ def read(file: str, order: str | None, direction: str | None, interpolation: str
         file_status = path.stat()
     except OSError as error:
         raise ValueError(f"which cannot be read: {error.strerror}") from None
-    if path.is_dir():
-        raise ValueError("which is a folder, but must be a CSV, Parquet or AEM file")
     return _read_version(path, order, direction, interpolation, epoch, (file_status.st_size, file_status.st_mtime_ns))
 
 

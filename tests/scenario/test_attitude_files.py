@@ -146,7 +146,7 @@ REFUSED = {
     "rotating frame": (message(Q, REF_FRAME_A="ITRF-97"), "REF_FRAME_A is ITRF-97"),
     "two inertial frames": (message(Q, REF_FRAME_B="ICRF"), "one must be inertial"),
     "interpolation": (message(Q, INTERPOLATION_METHOD="LINEAR"), "INTERPOLATION_METHOD is LINEAR"),
-    "version": (message(Q, "3.0"), "line 1: CCSDS_AEM_VERS is 3.0"),
+    "version": (message(Q, "3.0"), 'line 1: it is "CCSDS_AEM_VERS = 3.0"'),
     "another message": ("CIC_AEM_VERS = 1.0\n", "line 1"),
     "a line of data": (message(Q).replace(DATES[2], DATES[2] + " 0.1"), 'line 20: it is "'),
     "a number": (message(Q).replace(f" {Q[1, 1]:.15f}", " 0.x1"), "must be a time and 4 numbers"),
