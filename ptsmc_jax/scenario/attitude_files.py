@@ -164,15 +164,12 @@ def _quaternion_columns(names: dict[str, str], order: str | None) -> tuple[tuple
 
 def _read_numbers(frame: Any, name: str) -> np.ndarray:
     """Return a column as finite numbers (n,)."""
-    values = np.empty(frame.height)
-    for k, cell in enumerate(frame[name].to_list()):
-        try:
-            values[k] = float(cell)
-        except (TypeError, ValueError):
-            values[k] = np.nan
-        if not np.isfinite(values[k]):
-            shown = "empty" if cell is None else f'"{cell}"' if isinstance(cell, str) else cell
-            raise ValueError(f"row {k + 1}, column {name}: it is {shown}, but must be a finite number")
+    values = frame[name].cast(float, strict=False).to_numpy()
+    if not np.all(np.isfinite(values)):
+        k = int(np.argmin(np.isfinite(values)))
+        cell = frame[name][k]
+        shown = "empty" if cell is None else f'"{cell}"' if isinstance(cell, str) else cell
+        raise ValueError(f"row {k + 1}, column {name}: it is {shown}, but must be a finite number")
     return values
 
 

@@ -91,6 +91,12 @@ def _rotation(table: Attitude, name: str, key: str, array: np.ndarray) -> Any:
         ) from None
 
 
+def check_direction(key: str, value: tuple[float, ...]) -> None:
+    """Raise ScenarioError if a vector (3,) has no direction; `key`: its full key."""
+    if not 1e-100 < max(map(abs, value)) < 1e100:
+        raise wrong(key, value, "a direction, three numbers that are not all 0")
+
+
 def stated_keys(table: Attitude) -> list[str]:
     """Return the attitude keys that a table states."""
     return [key for key in ATTITUDE_KEYS if getattr(table, key) is not None]

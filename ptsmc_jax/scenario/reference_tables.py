@@ -216,8 +216,7 @@ class Mission(NamedTuple):
 
 def _check_axis(key: str, axis: tuple[float, ...], other: tuple[float, ...] | None = None) -> None:
     """Raise ScenarioError if a body axis (3,) is zero, or parallel to another one; key: its key."""
-    if np.linalg.norm(axis) == 0.0:
-        raise wrong(key, axis, "three numbers that are not all 0")
+    attitude_keys.check_direction(key, axis)
     if other is not None:
         sine = np.linalg.norm(np.cross(axis, other)) / (np.linalg.norm(axis) * np.linalg.norm(other))
         if sine < np.sin(SMALLEST_ANGLE):

@@ -15,6 +15,7 @@ from msgspec import Meta
 from ptsmc_jax import formulas
 from ptsmc_jax.devices import attitude_sensors, kalman_filter, sensor_suite
 from ptsmc_jax.numerics.pytrees import vector
+from ptsmc_jax.scenario import attitude_keys
 from ptsmc_jax.scenario.custom import custom_kind
 from ptsmc_jax.scenario.device_tables import WHOLE_TOLERANCE, Hardware
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
@@ -63,7 +64,7 @@ class AttitudeSensorTable(SensorTable, frozen=True):
         super().check_alone(place)
         if self.boresight is not None and self.rotvec_deg is not None:
             raise wrong(f"{place}.rotvec_deg", self.rotvec_deg, "absent if boresight is given")
-        _check_direction(f"{place}.boresight", self.boresight or (0.0, 0.0, 1.0))
+        attitude_keys.check_direction(f"{place}.boresight", self.boresight or (0.0, 0.0, 1.0))
 
     def check(self, place: str, scenario: Any) -> None:
         """Raise ScenarioError for a sensor that is faster than the loop, slower than the run, or very late."""
@@ -145,7 +146,7 @@ class VectorSensor(AttitudeSensorTable, frozen=True):
     def check_alone(self, place: str) -> None:
         """Raise ScenarioError also for a zero direction."""
         super().check_alone(place)
-        _check_direction(f"{place}.direction", self.direction)
+        attitude_keys.check_direction(f"{place}.direction", self.direction)
 
     def sigmas(self) -> tuple[float, ...]:
         """Return the noise of each component [rad]."""
@@ -315,8 +316,3 @@ class SensorSuite(Table, frozen=True):
         return sensor_suite.SensorSuite(
             sensors=tuple(sensors), rate_noise=gyro, rate_bias=jnp.full(3, bias), bias_rate=bias_rate, filter=estimator
         )
-
-
-def _check_direction(key: str, value: Any) -> None:
-    if not 1e-100 < max(map(abs, value)) < 1e100:
-        raise wrong(key, value, "a direction, three numbers that are not all 0")

@@ -167,8 +167,7 @@ class Pointing(Table, frozen=True):
 
         Two windows must fit into the observation, and one control period into a window.
         """
-        if not np.linalg.norm(self.boresight) > 0.0:
-            raise wrong("pointing.boresight", self.boresight, "a direction, not all zero")
+        attitude_keys.check_direction("pointing.boresight", self.boresight)
         available, needed = scenario.end - scenario.controller.t_f, 2.0 * self.window * (1 - 1e-9)
         if not available >= needed:
             raise wrong("pointing.window", self.window, f"at most half of loop.t_end - controller.t_f, {available:.6g}")
