@@ -68,7 +68,6 @@ class Quantity(NamedTuple):
             values.
         check_together: (all values of a run table, parts) -> None. It raises UnfitError if values of several quantities
             contradict each other.
-        categories: columns without an order, such as the number of a wheel.
         hardware: whether it is an error of the hardware or of the flexible modes that the flight software does not
             know.
     """
@@ -81,7 +80,6 @@ class Quantity(NamedTuple):
     unit: str | tuple[str, ...] = "-"
     validate: Validator = lambda rows: rows
     check_together: Callable[[TableValues, Parts], None] = lambda table, parts: None
-    categories: tuple[str, ...] = ()
     hardware: bool = False
 
     def count(self, parts: Parts) -> int:

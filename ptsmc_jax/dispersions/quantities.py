@@ -193,7 +193,7 @@ def _vector_columns(name: str, count: int) -> list[str]:
     return [f"{name}_{k + 1}{i + 1}" for k in range(count) for i in range(3)]
 
 
-_FAILURE_COLUMNS = ("wheel_failure_time", "wheel_failure_wheel")
+CATEGORIES = ("wheel_failure_wheel",)  # columns without an order
 
 # the order is the order of the columns
 QUANTITIES: dict[str, Quantity] = {
@@ -282,13 +282,12 @@ QUANTITIES: dict[str, Quantity] = {
         hardware=True,
     ),
     "wheel_failure": Quantity(
-        lambda parts: [] if parts.actuators.wheels is None else list(_FAILURE_COLUMNS),
+        lambda parts: [] if parts.actuators.wheels is None else ["wheel_failure_time", *CATEGORIES],
         _read_wheel_failure,
         _with_wheel_failure,
         _random_wheel_failure,
         unit=("s", "-"),
         check_together=_check_wheel_failure,
-        categories=_FAILURE_COLUMNS[1:],
         hardware=True,
     ),
     "timing_jitter": field_quantity(
@@ -319,10 +318,6 @@ QUANTITIES: dict[str, Quantity] = {
         hardware=True,
     ),
 }
-
-
-# columns without an order, such as the number of a wheel
-CATEGORIES = tuple(column for quantity in QUANTITIES.values() for column in quantity.categories)
 
 
 def read_columns(parts: Parts, names: Iterable[str]) -> dict[str, Array]:

@@ -239,9 +239,13 @@ class MissionTable(ReferenceTable, frozen=True):
     def check(self, scenario: Any) -> None:
         _check_axis("reference.primary_axis", self.primary_axis)
         _check_axis("reference.secondary_axis", self.secondary_axis, self.primary_axis)
+        self.initial_frame(scenario)
 
     def initial_frame(self, scenario: Any) -> np.ndarray:
-        """Return the rotation matrix (3, 3) at t = 0 from the axes of the frame to inertial axes."""
+        """Return the rotation matrix (3, 3) at t = 0 from the axes of the frame to inertial axes.
+
+        It raises ScenarioError if the scenario does not determine the directions.
+        """
         raise NotImplementedError
 
     def initial_reference_attitude(self, scenario: Any) -> np.ndarray:
@@ -260,10 +264,6 @@ class NadirTable(MissionTable, frozen=True):
 
     def frequencies(self, scenario: Any) -> dict[str, float]:
         return {"reference.kind": float(self._orbit(scenario).fastest())}
-
-    def check(self, scenario: Any) -> None:
-        super().check(scenario)
-        self._orbit(scenario)
 
     @property
     def mount(self) -> np.ndarray:
@@ -287,7 +287,7 @@ class DirectionsTable(MissionTable, frozen=True):
     def numpy_part(self, mission: Mission, anchors: np.ndarray = IDENTITY[None], rate: float = 0.0) -> Any:
         """Build the reference with NumPy numbers."""
         primary, secondary = self.directions(mission)
-        needs_orbit = primary.needs_orbit or secondary.needs_orbit
+        needs_orbit = any(isinstance(one, orbits.OrbitDirection | orbits.GroundPoint) for one in (primary, secondary))
         return self.part_class(
             q=IDENTITY, mount=self.mount, primary=primary, secondary=secondary,
             orbit=mission.build_orbit("reference") if needs_orbit else None,
@@ -296,10 +296,6 @@ class DirectionsTable(MissionTable, frozen=True):
 
     def frequencies(self, scenario: Any) -> dict[str, float]:
         return {"reference.kind": _sample(self, Mission.of(scenario)).fastest}
-
-    def check(self, scenario: Any) -> None:
-        super().check(scenario)
-        _sample(self, Mission.of(scenario))
 
     def build(self, scenario: Any) -> Any:
         mission = Mission.of(scenario)

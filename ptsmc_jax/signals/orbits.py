@@ -8,7 +8,7 @@ start JAX.
 """
 
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -163,11 +163,12 @@ def earth_angle(days: float) -> float:
     return float(2.0 * np.pi * ((0.7790572732640 + 0.00273781191135448 * days + days % 1.0) % 1.0))
 
 
+@pytree
 @dataclass(frozen=True)
-class Direction:
-    """Base of directions in inertial axes."""
+class Fixed:
+    """A constant direction. All directions are functions with the same arguments."""
 
-    needs_orbit: ClassVar[bool] = True
+    vector: Any  # (3,) vector in this direction, in inertial axes
 
     def __call__(self, t: Any, place: Any, orbit: Any, xp: Any) -> Any:
         """Return vectors (.., 3) of any length in inertial axes.
@@ -178,24 +179,12 @@ class Direction:
             orbit: the orbit, or None.
             xp: JAX's or NumPy's functions.
         """
-        raise NotImplementedError
-
-
-@pytree
-@dataclass(frozen=True)
-class Fixed(Direction):
-    """A constant direction."""
-
-    vector: Any  # (3,) vector in this direction, in inertial axes
-    needs_orbit: ClassVar[bool] = False
-
-    def __call__(self, t: Any, place: Any, orbit: Any, xp: Any) -> Any:
         return self.vector + 0.0 * xp.asarray(t)[..., None]
 
 
 @pytree
 @dataclass(frozen=True)
-class OrbitDirection(Direction):
+class OrbitDirection:
     """The direction to the Earth's centre, of the velocity, or of the orbit's angular momentum."""
 
     name: str = field(metadata={"static": True})  # "nadir", "velocity" or "orbit_normal"
@@ -211,7 +200,7 @@ class OrbitDirection(Direction):
 
 @pytree
 @dataclass(frozen=True)
-class GroundPoint(Direction):
+class GroundPoint:
     """The direction from the spacecraft to a point on the rotating Earth."""
 
     point: Any  # (3,) Earth-fixed coordinates of the point [m]
@@ -226,12 +215,11 @@ class GroundPoint(Direction):
 
 @pytree
 @dataclass(frozen=True)
-class Sun(Direction):
+class Sun:
     """The direction from the Earth to the Sun, to 0.01 deg (Astronomical Almanac, low-precision formulas)."""
 
     longitude: Any  # mean longitude of the Sun at t = 0 [rad]
     anomaly: Any  # mean anomaly of the Sun at t = 0 [rad]
-    needs_orbit: ClassVar[bool] = False
 
     def __call__(self, t: Any, place: Any, orbit: Any, xp: Any) -> Any:
         g = self.anomaly + np.deg2rad(0.9856003) / DAY * t
@@ -260,13 +248,9 @@ class MissionReference(Reference):
         """Return the quaternion (4,) [-] from the axes of the frame to inertial axes at the time t [s]."""
         raise NotImplementedError
 
-    def quaternion(self, t: Scalar) -> Float[Array, "4"]:
-        """Return the quaternion (4,) [-] of the reference at the time t [s]."""
-        return attitude.multiply(self.frame(t), attitude.multiply(self.mount, self.q))
-
     def __call__(self, t: Scalar) -> Target:
         """Return the target at the time t [s]."""
-        return target_of(self.quaternion, t)
+        return target_of(lambda t: attitude.multiply(self.frame(t), attitude.multiply(self.mount, self.q)), t)
 
 
 @pytree
@@ -285,7 +269,7 @@ class NadirReference(MissionReference):
 class TwoVectorReference(MissionReference):
     """One body axis points exactly in a primary direction, another one as near as possible to a secondary one."""
 
-    primary: Any  # an `Direction`
+    primary: Any  # a direction, such as `Fixed`
     secondary: Any
     orbit: Any  # `Orbit`, or None if no direction depends on it
     anchors: Leaf  # (n, 4) quaternions of the frame, without jumps of their signs, see `anchor_quaternions`
