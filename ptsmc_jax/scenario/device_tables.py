@@ -78,11 +78,6 @@ class Actuators(Table, frozen=True):
     noise_keys: ClassVar[tuple[str, ...]] = ()  # keys of sensor errors
 
     @property
-    def has_sensor_noise(self) -> bool:
-        """Whether any key of `noise_keys` is given."""
-        return any(getattr(self, key) is not None for key in self.noise_keys)
-
-    @property
     def delay_periods(self) -> int:
         """Control periods from the measurement to the torque."""
         return self.delay or 0

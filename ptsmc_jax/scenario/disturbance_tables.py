@@ -180,8 +180,9 @@ class GravityTable(Attitude, DisturbanceTable, frozen=True):
         moment_difference = moments[2] * (1.0 + deviation) - moments[0] * (1.0 - deviation)
         factor = 3.0 * rate * rate * moment_difference / (1.0 - e) ** 3
         perigee_rate = rate * math.sqrt(1.0 + e) / (1.0 - e) ** 1.5
+        initial_rate = sum(scenario.initial_rates.values())
         reference_rate = sum(scenario.reference.frequencies(scenario).values())
-        body_rate = scenario.initial_rate_bound + reference_rate + 2.0 * math.pi / scenario.controller.t_f
+        body_rate = initial_rate + reference_rate + 2.0 * math.pi / scenario.controller.t_f
         return Bounds(np.full(3, 0.5 * factor), np.full(3, factor * ((1.0 + 1.5 * e) * perigee_rate + body_rate)))
 
     def build(self, inertia: Any, scenario: Any) -> Any:

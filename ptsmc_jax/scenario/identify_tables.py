@@ -14,7 +14,6 @@ Quaternion = Annotated[
     Meta(description="a list of four names of columns, in the order of `quaternion_order`"),
 ]
 Axes = Annotated[tuple[Column, Column, Column], Meta(description="a list of three names of columns")]
-IF_LOGGED = "; default: {}, if the log has them"
 
 
 class Telemetry(Table, frozen=True):
@@ -23,26 +22,23 @@ class Telemetry(Table, frozen=True):
     time: Annotated[Column, Meaning("time in s, or date and time in ISO 8601")] = "t"
     attitude: Annotated[
         Quaternion | None,
-        Meaning("unit quaternion of the star tracker" + IF_LOGGED.format("measured_q1 to measured_q4")),
+        Meaning("unit quaternion of the star tracker; default: measured_q1 to measured_q4, if logged"),
     ] = None
     quaternion_order: Annotated[Literal["xyzw", "wxyz"], Meaning("scalar part last or first")] = "xyzw"
     rotation: Annotated[
         Literal["body_to_inertial", "inertial_to_body"],
         Meaning("the axes that the quaternion rotates from and to"),
     ] = "body_to_inertial"
-    attitude_age: Annotated[
-        Column | None,
-        Meaning("age of the attitude in s" + IF_LOGGED.format("measured_age")),
-    ] = None
-    rate: Annotated[Axes | None, Meaning("body rate of the gyro" + IF_LOGGED.format("measured_w1 to measured_w3"))] = (
+    attitude_age: Annotated[Column | None, Meaning("age of the attitude in s; default: measured_age, if logged")] = None
+    rate: Annotated[Axes | None, Meaning("body rate of the gyro; default: measured_w1 to measured_w3, if logged")] = (
         None
     )
     rate_unit: Annotated[Literal["rad/s", "deg/s", "deg/h"], Meaning("unit of the rate columns")] = "rad/s"
     torque: Annotated[
         Axes | None,
         Meaning(
-            "torque in body axes that the computer sends to the actuators, held until the next row"
-            + IF_LOGGED.format("sent1 to sent3")
+            "torque in body axes that the computer sends to the actuators, held until the next row; default: sent1 to "
+            "sent3, if logged"
         ),
     ] = None
     wheel_torque: Annotated[

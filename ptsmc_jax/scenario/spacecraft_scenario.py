@@ -400,20 +400,13 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         return self.reference.build(self)
 
     @property
-    def initial_rate_bound(self) -> float:
-        """Bound on the body rate at t = 0 [rad/s]; one dispersed rate in 10 000 exceeds it."""
-        return sum(self._initial_rates.values())
-
-    @property
-    def _initial_rates(self) -> dict[str, float]:
-        """The nominal and the dispersed part of `initial_rate_bound` [rad/s], by key."""
+    def initial_rates(self) -> dict[str, float]:
+        """The nominal and the dispersed body rate at t = 0 [rad/s] by key; one rate in 10 000 exceeds their sum."""
+        rates = {"initial.rate": float(np.linalg.norm(self.initial.rate))}
         table = getattr(self.dispersion, "rate", None)
-        dispersed = (
-            {}
-            if table is None
-            else {f"dispersion.rate.{table.width_key}": float(table.norm_quantile * table.widths()[0])}
-        )
-        return {"initial.rate": float(np.linalg.norm(self.initial.rate)), **dispersed}
+        if table is not None:
+            rates[f"dispersion.rate.{table.width_key}"] = float(table.norm_quantile * table.widths()[0])
+        return rates
 
     def frequencies(self, setup: Any, t_f: float) -> dict[str, float]:
         """Return the angular frequencies of start, reference, law, wheels and flexible modes [rad/s], by key.
@@ -422,7 +415,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
             setup: the parts without a clock.
             t_f: shortest prescribed time [s].
         """
-        frequencies = {**self._initial_rates, **self.reference.frequencies(self)}
+        frequencies = {**self.initial_rates, **self.reference.frequencies(self)}
         law = self.controller.law
         key, rate = law.half_turn_rate(self.controller, t_f)
         if not law.prescribed:
@@ -450,7 +443,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         least, middle, largest = np.linalg.eigvalsh(np.asarray(setup.plant.inertia))
         momenta = {
             "wheels.momentum": np.linalg.norm(np.asarray(wheels.axes) @ np.asarray(wheels.initial)),
-            **{key: largest * rate for key, rate in self._initial_rates.items()},
+            **{key: largest * rate for key, rate in self.initial_rates.items()},
             "disturbance.amplitude": sum(term.impulse(self.end) for term in self.terms),
         }
         return {key: float(moment) / math.sqrt(least * middle) for key, moment in momenta.items()}

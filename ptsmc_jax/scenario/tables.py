@@ -374,7 +374,8 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
     @property
     def uses_measurements(self) -> bool:
         """Whether the law uses measurements instead of the true state."""
-        return self.estimator.on or self.devices.has_sensor_noise
+        devices = self.devices
+        return self.estimator.on or any(getattr(devices, key) is not None for key in devices.noise_keys)
 
     @property
     def search(self) -> Tune:
