@@ -91,7 +91,7 @@ def _rotation(table: Attitude, name: str, key: str, array: np.ndarray) -> Any:
         ) from None
 
 
-def check_direction(key: str, value: tuple[float, ...]) -> None:
+def check_direction(key: str, value: Any) -> None:
     """Raise ScenarioError if a vector (3,) has no direction; `key`: its full key."""
     if not 1e-100 < max(map(abs, value)) < 1e100:
         raise wrong(key, value, "a direction, three numbers that are not all 0")

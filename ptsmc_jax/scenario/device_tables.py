@@ -352,7 +352,6 @@ class SteadyStateFilter(FilterTable, frozen=True):
 class KalmanFilter(SteadyStateFilter, frozen=True):
     """The filter of [[sensors]], about as fast as a steady-state filter. It has no keys: the sensors determine it."""
 
-    kind: Literal["kalman"] = "kalman"
     gains: ClassVar[tuple[str, ...]] = ()
 
 
