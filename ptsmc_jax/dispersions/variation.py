@@ -22,8 +22,7 @@ from ptsmc_jax.dispersions.base import (
     Coordinates,
     Draw,
 )
-from ptsmc_jax.dispersions.inertias import CorrelatedInertia, RelativeInertia
-from ptsmc_jax.dispersions.numbers import RandomNumbers
+from ptsmc_jax.dispersions.numbers import CorrelatedInertia, RandomNumbers, RelativeInertia
 from ptsmc_jax.dispersions.quantities import QUANTITIES
 from ptsmc_jax.numerics import draws, paths
 from ptsmc_jax.numerics.draws import WholeNumber

@@ -16,7 +16,7 @@ from jax.tree_util import keystr, tree_flatten_with_path
 from jaxtyping import Array
 
 from ptsmc_jax.devices.actuators import Actuators
-from ptsmc_jax.dispersions import inertias
+from ptsmc_jax.dispersions import numbers
 from ptsmc_jax.dispersions.quantities import PAIRS
 from ptsmc_jax.identification.filtering import Model
 from ptsmc_jax.identification.telemetry import Measurements
@@ -471,7 +471,7 @@ def _coupling_parameter(model: Model, sigmas: np.ndarray, has_prior: bool) -> Pa
 def _inertia_parameter(start: np.ndarray, prior: Any) -> Parameter:
     """Return the inertia parameter, in log-Cholesky coordinates of the pseudo-inertia. Every value is physical."""
     table = getattr(prior, "inertia", None)
-    root = vector(inertias.pseudo_root(start))
+    root = vector(numbers.pseudo_root(start))
     if table is not None and hasattr(table, "factor"):
         factor = table.matrix()
     else:
@@ -486,7 +486,7 @@ def _inertia_parameter(start: np.ndarray, prior: Any) -> Parameter:
         factor = np.linalg.solve(inertia_derivatives(start), _raise_singular_values(by_prior, std * np.min(moments)))
 
     def write(model: Model, c: Array) -> Model:
-        inertia = inertias.from_coordinates(root, c)
+        inertia = numbers.from_coordinates(root, c)
         plant = model.plant.with_inertia(inertia, matrices.solve(inertia, jnp.eye(3)))
         return replace(model, plant=plant, disturbance=disturbances.on_body(model.disturbance, inertia))
 
@@ -498,8 +498,8 @@ def _inertia_parameter(start: np.ndarray, prior: Any) -> Parameter:
 
 def inertia_derivatives(inertia: np.ndarray) -> np.ndarray:
     """Return the derivatives (6, 6) [kg m^2] of the entries of an inertia (3, 3) by its log-Cholesky coordinates."""
-    root = vector(inertias.pseudo_root(inertia))
-    return np.asarray(jax.jacfwd(lambda c: _upper_triangle(inertias.from_coordinates(root, c)))(jnp.zeros(6)))
+    root = vector(numbers.pseudo_root(inertia))
+    return np.asarray(jax.jacfwd(lambda c: _upper_triangle(numbers.from_coordinates(root, c)))(jnp.zeros(6)))
 
 
 def _raise_singular_values(factor: np.ndarray, size: float) -> np.ndarray:

@@ -18,7 +18,7 @@ from ptsmc_jax.numerics import csv_tables
 from ptsmc_jax.scenario.identify_tables import StateTelemetry, Telemetry
 from ptsmc_jax.scenario.parsing import nearest_name_hint
 from ptsmc_jax.scenario.tables import Scenario
-from ptsmc_jax.signals import attitude_tables
+from ptsmc_jax.signals import references
 from ptsmc_jax.simulation.catalogues import UNITS
 
 MIN_ROWS = 10  # smallest number of rows of a log
@@ -258,7 +258,7 @@ def _read_attitudes(config: Any, table: _Table, columns: Sequence[str]) -> Value
     if config.rotation == "inertial_to_body":
         q[:, :3] *= -1.0
     has_attitude = ~np.isnan(q[:, 0])
-    q[has_attitude] = attitude_tables.with_continuous_signs(q[has_attitude])
+    q[has_attitude] = references.with_continuous_signs(q[has_attitude])
     return q
 
 

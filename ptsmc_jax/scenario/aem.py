@@ -14,7 +14,7 @@ import numpy as np
 
 from ptsmc_jax.scenario import epochs
 from ptsmc_jax.scenario.epochs import Epoch
-from ptsmc_jax.signals import attitude_tables
+from ptsmc_jax.signals import references
 
 VERSIONS = ("1.0", "2.0")
 INERTIAL_FRAMES = ("EME2000", "J2000", "GCRF", "ICRF", "MOD", "TOD", "TEME", "MEME", "EMEJ2000")
@@ -192,11 +192,11 @@ def _convert_attitudes(block: Block, numbers: np.ndarray) -> tuple[np.ndarray, n
 
     def body_to_inertial(values: np.ndarray) -> np.ndarray:
         values = np.roll(values, -1, axis=1) if scalar_position == "FIRST" else values
-        return values if from_inertial == (direction == "A2B") else values * attitude_tables.CONJUGATE
+        return values if from_inertial == (direction == "A2B") else values * references.CONJUGATE
 
     quaternions, rates = body_to_inertial(numbers[:, :4]), None
     if kind == "QUATERNION/DERIVATIVE":
-        rates = attitude_tables.body_rates(quaternions, body_to_inertial(numbers[:, 4:]))
+        rates = references.body_rates(quaternions, body_to_inertial(numbers[:, 4:]))
     elif kind != "QUATERNION":
         rates = np.deg2rad(numbers[:, 4:])
         rates = rates if from_inertial else -rates  # rates in a message are of frame B relative to frame A

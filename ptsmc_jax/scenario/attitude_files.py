@@ -12,7 +12,7 @@ import numpy as np
 
 from ptsmc_jax.scenario import aem, epochs
 from ptsmc_jax.scenario.epochs import Epoch
-from ptsmc_jax.signals import attitude_tables
+from ptsmc_jax.signals import references
 
 TIME_NAMES = ("t", "time", "time_s", "seconds", "epoch", "utc", "time_utc", "datetime")
 # names that label the scalar part, with its order
@@ -91,25 +91,25 @@ def _check_samples(
         k = int(np.argmin(steps > 0.0)) + 1
         raise ValueError(f"sample {k + 1}: its time, {times[k]:.12g} s, is not after the time before it, "
                          f"{times[k - 1]:.12g} s")  # fmt: skip
-    if attitude_tables.count_intervals(times) > attitude_tables.MOST_INTERVALS:
+    if references.count_intervals(times) > references.MOST_INTERVALS:
         raise ValueError(f"whose times have steps from {steps.min():.3g} to {steps.max():.3g} s; the whole span may be "
-                         f"at most {attitude_tables.MOST_INTERVALS} of the smallest step")  # fmt: skip
+                         f"at most {references.MOST_INTERVALS} of the smallest step")  # fmt: skip
     norms = np.linalg.norm(quaternions, axis=1)
     if np.abs(norms - 1.0).max() > LARGEST_NORM_ERROR:
         k = int(np.argmax(np.abs(norms - 1.0)))
         raise ValueError(f"sample {k + 1}: the norm of its quaternion is {norms[k]:.6g}, but must be 1 within "
                          f"{LARGEST_NORM_ERROR:g}")  # fmt: skip
-    q = attitude_tables.with_continuous_signs(quaternions / norms[:, None])
+    q = references.with_continuous_signs(quaternions / norms[:, None])
     turns = 4.0 * np.arctan2(np.linalg.norm(np.diff(q, axis=0), axis=1), np.linalg.norm(q[1:] + q[:-1], axis=1))
-    if turns.max() > attitude_tables.LARGEST_TURN:
+    if turns.max() > references.LARGEST_TURN:
         k = int(np.argmax(turns))
         raise ValueError(f"sample {k + 2}: it is {np.rad2deg(turns[k]):.4g} deg from the sample before it, and at most "
-                         f"{np.rad2deg(attitude_tables.LARGEST_TURN):g} deg are allowed")  # fmt: skip
+                         f"{np.rad2deg(references.LARGEST_TURN):g} deg are allowed")  # fmt: skip
     end_rates = None if rates is None else rates[[0, -1]]
-    all_rates = attitude_tables.sample_rates(times, q, end_rates)
+    all_rates = references.sample_rates(times, q, end_rates)
     largest = np.linalg.norm(all_rates, axis=1).max()
     if rates is not None:
-        errors = np.linalg.norm(attitude_tables.sample_rates(times, q) - rates, axis=1)
+        errors = np.linalg.norm(references.sample_rates(times, q) - rates, axis=1)
         if errors.max() > LARGEST_RATE_ERROR * largest + 1e-9:
             k = int(np.argmax(errors))
             raise ValueError(f"sample {k + 1}: its rate differs from the derivative of its quaternions by "
@@ -138,7 +138,7 @@ def _read_table(
     quaternions = np.stack([_read_numbers(frame, names[name]) for name in columns], axis=1)
     quaternions = quaternions if scalar_last else np.roll(quaternions, -1, axis=1)
     if direction == "inertial_to_body":
-        quaternions = quaternions * attitude_tables.CONJUGATE
+        quaternions = quaternions * references.CONJUGATE
     rate_names = next((rate_names for rate_names in RATE_NAMES if any(name in names for name in rate_names)), None)
     missing = next((name for name in rate_names or () if name not in names), None)
     if missing is not None:

@@ -12,7 +12,7 @@ import numpy as np
 from msgspec import Meta
 
 from ptsmc_jax.declare import Scaled
-from ptsmc_jax.dispersions import inertias
+from ptsmc_jax.dispersions import numbers
 from ptsmc_jax.dispersions.numbers import RandomNumbers, any_attitude, axis_angle, interval
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.scenario.custom_devices import CUSTOM_DRAW
@@ -208,15 +208,15 @@ class RelativeInertia(Table, frozen=True):
         return 3.0 * self.std
 
     def build(self, parts: Any, count: int) -> Any:
-        """Return `dispersions.inertias.RelativeInertia` about the inertia of the true body."""
+        """Return `dispersions.numbers.RelativeInertia` about the inertia of the true body."""
         moments, axes = np.linalg.eigh(np.asarray(parts.plant.inertia))
-        return inertias.RelativeInertia(*map(vector, (moments, axes, self.std, np.deg2rad(self.axes_deg))))
+        return numbers.RelativeInertia(*map(vector, (moments, axes, self.std, np.deg2rad(self.axes_deg))))
 
 
 class CorrelatedInertia(Table, frozen=True):
     """Correlated errors of the true inertia, as `ptsmc identify` estimates them. Every sample is a physical inertia.
 
-    The coordinates are those of `dispersions.inertias.CorrelatedInertia`, and zeros give the nominal inertia.
+    The coordinates are those of `dispersions.numbers.CorrelatedInertia`, and zeros give the nominal inertia.
     """
 
     kind: Literal["correlated"] = "correlated"
@@ -248,9 +248,9 @@ class CorrelatedInertia(Table, frozen=True):
         return np.array([[*row, *(0.0,) * (6 - len(row))] for row in self.factor])
 
     def build(self, parts: Any, count: int) -> Any:
-        """Return `dispersions.inertias.CorrelatedInertia` about the inertia of the true body."""
-        return inertias.CorrelatedInertia(
-            vector(inertias.pseudo_root(np.asarray(parts.plant.inertia))), vector(self.matrix())
+        """Return `dispersions.numbers.CorrelatedInertia` about the inertia of the true body."""
+        return numbers.CorrelatedInertia(
+            vector(numbers.pseudo_root(np.asarray(parts.plant.inertia))), vector(self.matrix())
         )
 
 

@@ -18,7 +18,7 @@ from ptsmc_jax.scenario.custom import Custom, custom_kind, fastest_rate
 from ptsmc_jax.scenario.errors import ScenarioError, show, value_error, wrong
 from ptsmc_jax.scenario.schema import PartTable, make_table
 from ptsmc_jax.scenario.values import Four, Kinds, Meaning, Number, Three
-from ptsmc_jax.signals import attitude_tables, orbits, references
+from ptsmc_jax.signals import orbits, references
 
 Vector = Annotated[
     Literal["nadir", "velocity", "orbit_normal", "sun"] | tuple[float, float, float],
@@ -153,7 +153,7 @@ class FileReference(ReferenceTable, frozen=True):
 
     def build(self, scenario: Any) -> Any:
         samples = self._samples(scenario)
-        return attitude_tables.interpolate_attitude(samples.times, samples.quaternions, samples.end_rates)
+        return references.interpolate_attitude(samples.times, samples.quaternions, samples.end_rates)
 
     def initial_reference_attitude(self, scenario: Any) -> np.ndarray:
         self.check(scenario)
@@ -403,7 +403,7 @@ REFERENCES: Kinds = {
     "spin": make_table(AttitudeReference, references.Spin, "spin"),
     "sinusoid": make_table(AttitudeReference, references.Swing, "sinusoid"),
     "slew": make_table(SlewTable, references.Slew, "slew"),
-    "table": make_table(FileReference, attitude_tables.TableReference, "table"),
+    "table": make_table(FileReference, references.TableReference, "table"),
     "nadir": make_table(NadirTable, orbits.NadirReference, "nadir"),
     "ground_target": make_table(GroundTargetTable, orbits.GroundTargetReference, "ground_target"),
     "two_vector": make_table(TwoVectorTable, orbits.TwoVectorReference, "two_vector"),

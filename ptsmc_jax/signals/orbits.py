@@ -18,8 +18,7 @@ from jaxtyping import Array, Float
 from ptsmc_jax.declare import number
 from ptsmc_jax.numerics import attitude, elementary
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
-from ptsmc_jax.signals import attitude_tables
-from ptsmc_jax.signals.references import Reference, Target, target_of
+from ptsmc_jax.signals.references import Reference, Target, target_of, with_continuous_signs
 
 EARTH_RATE = 7.292115e-5  # rotation rate of the Earth, WGS-84 [rad/s]
 EQUATORIAL_RADIUS, FLATTENING = 6_378_137.0, 1.0 / 298.257223563  # WGS-84 ellipsoid [m, -]
@@ -359,7 +358,7 @@ def anchor_quaternions(matrices: np.ndarray) -> np.ndarray:
     """
     from scipy.spatial.transform import Rotation
 
-    q = attitude_tables.with_continuous_signs(Rotation.from_matrix(matrices).as_quat())
+    q = with_continuous_signs(Rotation.from_matrix(matrices).as_quat())
     count = 1
     while count < len(q):
         intervals = q.reshape(count, -1, 4)

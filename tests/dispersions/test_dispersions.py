@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from ptsmc_jax import scenario
 from ptsmc_jax.batching import lanes
 from ptsmc_jax.devices import actuators
-from ptsmc_jax.dispersions import base, inertias, numbers, quantities
+from ptsmc_jax.dispersions import base, numbers, quantities
 from ptsmc_jax.dispersions.numbers import RandomNumbers
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.signals import disturbances, references
@@ -171,7 +171,7 @@ def parts_of_trials(dispersion, run=PARTS, count=TRIALS, seed=4):
 
 def sample_inertias(moments, std, turn=0.0, axes=None):
     axes = np.eye(3) if axes is None else axes
-    kind = inertias.RelativeInertia(vector(moments), vector(axes), vector(std), vector(turn))
+    kind = numbers.RelativeInertia(vector(moments), vector(axes), vector(std), vector(turn))
     plant = plants_of(Dispersion({"inertia": kind}), jnp.arange(TRIALS, dtype=jnp.uint32))
     return np.asarray(plant.inertia), np.asarray(plant.inertia_inverse)
 
@@ -245,9 +245,9 @@ BODIES = list(itertools.product(MOMENTS, (0.05, 0.3)))
 def test_fallback_samples_have_the_distribution_of_repeated_rejection(moments, std):
     """All candidates are set beyond three sigma, so that only the fallback for slender bodies is used."""
     rng = np.random.default_rng(1)
-    kind = inertias.RelativeInertia(vector(moments), vector(np.eye(3)), vector(std), vector(0.0))
+    kind = numbers.RelativeInertia(vector(moments), vector(np.eye(3)), vector(std), vector(0.0))
     c = rng.standard_normal((1 << 15, kind.count))
-    c[:, : 3 * inertias.CANDIDATES] = 9.0
+    c[:, : 3 * numbers.CANDIDATES] = 9.0
     found = np.diagonal(np.asarray(inertia_of(kind, vector(c))), axis1=1, axis2=2)
     standard = rng.standard_normal((1 << 19, 3))
     expected = np.array(moments) * (1.0 + std * standard)
@@ -262,10 +262,10 @@ def test_fallback_samples_have_the_distribution_of_repeated_rejection(moments, s
 
 def test_first_physical_candidate_is_used():
     rng, moments, std = np.random.default_rng(2), np.array([10.0, 12.0, 20.0]), 0.2
-    kind = inertias.RelativeInertia(vector(moments), vector(np.eye(3)), vector(std), vector(0.0))
+    kind = numbers.RelativeInertia(vector(moments), vector(np.eye(3)), vector(std), vector(0.0))
     c = rng.standard_normal((1 << 15, kind.count))
     found = np.diagonal(np.asarray(inertia_of(kind, vector(c))), axis1=1, axis2=2)
-    standard = c[:, : 3 * inertias.CANDIDATES].reshape(len(c), -1, 3)
+    standard = c[:, : 3 * numbers.CANDIDATES].reshape(len(c), -1, 3)
     candidates = moments * (1.0 + std * standard)
     is_valid = 2.0 * candidates.max(axis=2) <= candidates.sum(axis=2)
     is_valid &= np.abs(standard).max(axis=2) <= numbers.TRUNCATION_SIGMAS
@@ -282,8 +282,8 @@ def test_sampled_inertias_have_finite_derivatives(moments):
     """This includes a standard deviation of zero and extreme random numbers."""
     for std, first in itertools.product((0.0, 0.05), (0.5, 9.0)):
         for size in (0.3, 6.7):
-            kind = inertias.RelativeInertia(vector(moments), vector(np.eye(3)), vector(std), vector(0.1))
-            c = jnp.full(kind.count, size).at[: 3 * inertias.CANDIDATES].set(first)
+            kind = numbers.RelativeInertia(vector(moments), vector(np.eye(3)), vector(std), vector(0.1))
+            c = jnp.full(kind.count, size).at[: 3 * numbers.CANDIDATES].set(first)
             assert all(np.all(np.isfinite(jacobian)) for jacobian in jax.tree.leaves(inertia_jacobians(kind, c)))
 
 
@@ -322,7 +322,7 @@ def test_phases_are_uniform_and_independent():
 
 
 def test_gravity_gradient_acts_on_the_sampled_inertia():
-    kind = inertias.RelativeInertia(vector([10.0, 12.0, 14.0]), vector(np.eye(3)), vector(0.05), vector(0.0))
+    kind = numbers.RelativeInertia(vector([10.0, 12.0, 14.0]), vector(np.eye(3)), vector(0.05), vector(0.0))
     run = replace(PARTS, disturbance=disturbances.Sum((ORBIT, SINE)))
     got = jax.jit(lambda: Dispersion({"inertia": kind}).apply(run, 1, 2))()
     np.testing.assert_array_equal(got.disturbance.terms[0].inertia, got.plant.inertia)
@@ -389,7 +389,7 @@ def test_initial_attitude_is_relative_to_the_random_reference():
 
 
 def test_random_numbers_of_a_quantity_do_not_depend_on_other_quantities():
-    inertia = inertias.RelativeInertia(vector([10.0, 12.0, 14.0]), vector(np.eye(3)), vector(0.05), vector(0.1))
+    inertia = numbers.RelativeInertia(vector([10.0, 12.0, 14.0]), vector(np.eye(3)), vector(0.05), vector(0.1))
     tenths = RandomNumbers("uniform", vector([0.5] * 3))
     kinds = {
         "initial_attitude": (KINDS["normal"], lambda p: p.initial.q),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ptsmc_jax import explore, formulas, scenario
-from ptsmc_jax.dispersions import inertias
+from ptsmc_jax.dispersions import numbers
 from ptsmc_jax.dispersions.quantities import PAIRS
 from ptsmc_jax.identification import estimation, filtering, results, telemetry
 from ptsmc_jax.scenario import parsing
@@ -118,12 +118,12 @@ def test_the_verdict_on_short_logs_is_calibrated(samples):
 
 def test_every_value_of_the_coordinates_is_the_inertia_of_a_body():
     rng = np.random.default_rng(0)
-    root = jnp.asarray(inertias.pseudo_root(np.diag([0.05, 0.09, 0.1399])))  # nearly flat
-    many = jax.vmap(lambda c: inertias.from_coordinates(root, c))(3.0 * rng.standard_normal((500, 6)))
+    root = jnp.asarray(numbers.pseudo_root(np.diag([0.05, 0.09, 0.1399])))  # nearly flat
+    many = jax.vmap(lambda c: numbers.from_coordinates(root, c))(3.0 * rng.standard_normal((500, 6)))
     moments = np.linalg.eigvalsh(np.asarray(many))
     assert np.all(moments[:, 0] > 0.0)
     assert np.all(moments[:, 2] <= (moments[:, 0] + moments[:, 1]) * (1.0 + 1e-12))
-    np.testing.assert_allclose(inertias.from_coordinates(root, jnp.zeros(6)), np.diag([0.05, 0.09, 0.1399]), rtol=1e-12)
+    np.testing.assert_allclose(numbers.from_coordinates(root, jnp.zeros(6)), np.diag([0.05, 0.09, 0.1399]), rtol=1e-12)
 
 
 @pytest.mark.long

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ptsmc_jax.campaigns import montecarlo
-from ptsmc_jax.dispersions import inertias, numbers, variation
+from ptsmc_jax.dispersions import numbers, variation
 from ptsmc_jax.dispersions.numbers import RandomNumbers
 from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation import clock, pointing
@@ -315,7 +315,7 @@ def test_the_hardest_screened_trial_is_the_worst_case_if_nothing_can_be_moved():
     """The true inertia cannot be moved, and neither can noise."""
     body = vector([10.0, 12.0, 14.0]), vector(np.eye(3)), vector(0.05), vector(0.0)
     spread = variation.Dispersion(
-        {"initial_attitude": numbers.any_attitude(), "inertia": inertias.RelativeInertia(*body)}
+        {"initial_attitude": numbers.any_attitude(), "inertia": numbers.RelativeInertia(*body)}
     )
     assert simulations.differentiable_dispersions(spread) == ("initial_attitude",)
     run = chain_parts([1.0, 0.0], T_F, ETA, 1.0, period=0.2, noise=[1e-2, 1e-3])

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from ptsmc_jax.batching import lanes, lapack
 from ptsmc_jax.numerics.pytrees import vector
-from ptsmc_jax.signals import attitude_tables, references
+from ptsmc_jax.signals import references
 
 START = Rotation.from_rotvec([0.4, -0.2, 0.9])
 SLEW = references.Slew(vector(START.as_quat()), vector([0.5, -0.6, 0.7]), vector(60.0))  # 60 deg in 60 s
@@ -36,7 +36,7 @@ def apart(q, p):
 
 def test_slew_sampled_at_1_hz_has_the_accuracy_of_the_analytic_one():
     times, between = np.arange(0.0, 76.0), np.linspace(0.0, 75.0, 4001)
-    reference = attitude_tables.interpolate_attitude(times, at(SLEW, times).q)
+    reference = references.interpolate_attitude(times, at(SLEW, times).q)
     found, true = at(reference, between), at(SLEW, between)
     assert apart(found.q, true.q).max() < 1e-6
     assert np.abs(found.w - true.w).max() < 1e-6
@@ -48,14 +48,14 @@ def test_error_of_the_attitude_falls_with_the_fourth_power_of_the_interval():
     def error(step):
         times = np.arange(0.0, 40.0 + step, step)
         between = np.linspace(10.0, 30.0, 501)
-        return apart(at(attitude_tables.interpolate_attitude(times, wander(times)), between).q, wander(between)).max()
+        return apart(at(references.interpolate_attitude(times, wander(times)), between).q, wander(between)).max()
 
     assert error(1.0) / error(0.5) == pytest.approx(16.0, rel=0.2)
 
 
 def test_samples_are_exact_and_signs_continuous():
     flipped = wander(UNEVEN) * np.array([1, -1, -1, 1, 1, -1, 1, -1, 1])[:, None]
-    reference = attitude_tables.interpolate_attitude(UNEVEN, flipped)
+    reference = references.interpolate_attitude(UNEVEN, flipped)
     q = at(reference, UNEVEN).q
     assert apart(q, wander(UNEVEN)).max() < 1e-15
     between = at(reference, np.linspace(0.0, 9.0, 301)).q
@@ -63,14 +63,14 @@ def test_samples_are_exact_and_signs_continuous():
 
 
 def test_attitude_rate_and_acceleration_are_continuous():
-    reference = attitude_tables.interpolate_attitude(UNEVEN, wander(UNEVEN))
+    reference = references.interpolate_attitude(UNEVEN, wander(UNEVEN))
     before, after = (at(reference, UNEVEN[1:-1] * (1.0 + side)) for side in (-1e-13, 1e-13))
     for name in ("q", "w", "w_dot"):
         np.testing.assert_allclose(getattr(before, name), getattr(after, name), rtol=0, atol=1e-11)
 
 
 def test_rates_are_the_derivatives_of_the_quaternion():
-    reference = attitude_tables.interpolate_attitude(UNEVEN, wander(UNEVEN))
+    reference = references.interpolate_attitude(UNEVEN, wander(UNEVEN))
     for t in (0.3, 2.5, 8.0):
         by_derivative = references.target_of(lambda t: reference(t).q, jnp.asarray(t))
         got = reference(jnp.asarray(t))
@@ -81,7 +81,7 @@ def test_rates_are_the_derivatives_of_the_quaternion():
 def test_far_from_the_ends_it_equals_the_rotation_spline_of_scipy():
     times = np.arange(0.0, 40.0, 0.25)
     reference, other = (
-        attitude_tables.interpolate_attitude(times, wander(times)),
+        references.interpolate_attitude(times, wander(times)),
         RotationSpline(times, Rotation.from_quat(wander(times))),
     )
     between = np.linspace(15.0, 25.0, 201)
@@ -92,12 +92,12 @@ def test_far_from_the_ends_it_equals_the_rotation_spline_of_scipy():
 def test_rates_at_the_ends_are_those_of_the_samples():
     times = np.arange(0.0, 9.0)
     ends = np.array([[0.1, 0.0, 0.2], [0.0, -0.1, 0.0]])
-    reference = attitude_tables.interpolate_attitude(times, wander(times), ends)
+    reference = references.interpolate_attitude(times, wander(times), ends)
     np.testing.assert_allclose(at(reference, times[[0, -1]]).w, ends, atol=1e-15)
 
 
 def test_outside_of_the_samples_it_rests():
-    reference = attitude_tables.interpolate_attitude(UNEVEN, wander(UNEVEN))
+    reference = references.interpolate_attitude(UNEVEN, wander(UNEVEN))
     outside = at(reference, np.array([-1.0, 20.0]))
     assert apart(outside.q, wander(UNEVEN[[0, -1]])).max() < 1e-15
     np.testing.assert_array_equal(outside.w, np.zeros((2, 3)))
@@ -105,7 +105,7 @@ def test_outside_of_the_samples_it_rests():
 
 
 def test_lanes_equal_single_evaluations_and_gradients_are_finite():
-    reference = attitude_tables.interpolate_attitude(UNEVEN, wander(UNEVEN))
+    reference = references.interpolate_attitude(UNEVEN, wander(UNEVEN))
     times = jnp.asarray([0.0, 0.7, 3.3, 9.0])
     batched = lanes.vmap(reference)(times)
     single = [reference(t) for t in times]
@@ -119,7 +119,7 @@ def test_lanes_equal_single_evaluations_and_gradients_are_finite():
     "times", [UNEVEN, np.linspace(0.0, 7.0, 50), np.array([0.0, 1e-3, 5.0]), np.array([-3.0, 4.0])]
 )
 def test_every_time_finds_its_interval(times):
-    reference = attitude_tables.interpolate_attitude(times, wander(times))
+    reference = references.interpolate_attitude(times, wander(times))
     inside = np.sort(np.concatenate([times, np.random.default_rng(0).uniform(times[0], times[-1], 500)]))
     exact = CubicHermiteSpline(times, np.asarray(reference.samples), np.asarray(reference.slopes))(inside)
     assert apart(at(reference, inside).q, exact).max() < 1e-12
