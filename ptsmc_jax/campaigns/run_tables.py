@@ -96,12 +96,9 @@ def read(path: Path) -> pl.DataFrame:
     if not kinds or not (kinds == {".parquet"} or kinds == {".csv"}):
         raise RefusedError(f"--runs is {path}, but must be {ALLOWED}")
     try:
-        if kinds == {".csv"}:
-            return csv_tables.read(path)
-        return pl.concat([pl.read_parquet(file, glob=False) for file in files])
-    except (OSError, ValueError, pl.exceptions.PolarsError) as error:
-        first_line = (str(error).splitlines() or [type(error).__name__])[0]
-        raise RefusedError(f"--runs is {path}, which cannot be read: {first_line}") from None
+        return pl.concat([csv_tables.read_table(file) for file in files])
+    except (ValueError, pl.exceptions.PolarsError) as error:
+        raise RefusedError(f"--runs is {path}, which cannot be read: {str(error).splitlines()[0]}") from None
 
 
 def check_table(

@@ -50,15 +50,12 @@ def read(path: Path) -> pl.DataFrame:
     allowed = "a .csv or .parquet file with a row for each time"
     if not path.is_file():
         raise RefusedError(f"there is no file {path}; a log is {allowed}")
+    if path.suffix.lower() not in (".csv", ".parquet"):
+        raise RefusedError(f"the log is {path}, but must be {allowed}")
     try:
-        if path.suffix.lower() == ".csv":
-            return csv_tables.read(path)
-        if path.suffix.lower() == ".parquet":
-            return pl.read_parquet(path, glob=False)
-    except (OSError, ValueError, pl.exceptions.PolarsError) as error:
-        first_line = (str(error).splitlines() or [type(error).__name__])[0]
-        raise RefusedError(f"the log {path} cannot be read: {first_line}") from None
-    raise RefusedError(f"the log is {path}, but must be {allowed}")
+        return csv_tables.read_table(path)
+    except ValueError as error:
+        raise RefusedError(f"the log {path} cannot be read: {error}") from None
 
 
 def measurements(scenario: Scenario, frame: pl.DataFrame, name: str = "the log") -> Measurements:

@@ -1,4 +1,4 @@
-"""Read CSV tables that spreadsheets, pandas or R have written. Start with `read`."""
+"""Read Parquet files, and CSV tables that spreadsheets, pandas or R have written. Start with `read_table`."""
 
 import codecs
 import csv
@@ -15,6 +15,14 @@ UNNAMED = re.compile(r"(Unnamed: \d+)?")  # pandas names such a column when it r
 NUMBER = re.compile(r"[-+]?[\d.,]+([eE][-+]?\d+)?")
 WITH_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
 WITH_POINT = re.compile(WITH_COMMA.pattern.replace(",", r"\."))
+
+
+def read_table(path: Path) -> pl.DataFrame:
+    """Return the columns of a CSV or Parquet file; raise ValueError with one line of text if it is not readable."""
+    try:
+        return read(path) if path.suffix.lower() == ".csv" else pl.read_parquet(path, glob=False)
+    except (OSError, ValueError, pl.exceptions.PolarsError) as error:
+        raise ValueError((str(error).splitlines() or [type(error).__name__])[0]) from None
 
 
 def read(path: Path) -> pl.DataFrame:

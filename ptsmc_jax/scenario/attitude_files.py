@@ -122,14 +122,9 @@ def _read_table(
     path: Path, order: str | None, direction: str | None, start_epoch: Epoch | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Return times (n,) [s], quaternions (n, 4) and rates (n, 3) [rad/s] or None of a CSV or Parquet file."""
-    import polars as pl  # the import takes 0.1 s, and most scenarios do not need it
+    from ptsmc_jax.numerics import csv_tables  # imports polars, which most scenarios do not need
 
-    from ptsmc_jax.numerics import csv_tables
-
-    try:
-        frame = csv_tables.read(path) if path.suffix.lower() == ".csv" else pl.read_parquet(path, glob=False)
-    except (OSError, ValueError, pl.exceptions.PolarsError) as error:
-        raise ValueError((str(error).splitlines() or [type(error).__name__])[0]) from None
+    frame = csv_tables.read_table(path)
     names = {name.strip().lower(): name for name in frame.columns}
     time_name = next((name for name in TIME_NAMES if name in names), None)
     if time_name is None:
