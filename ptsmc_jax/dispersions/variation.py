@@ -1,7 +1,7 @@
 """The dispersion of a campaign: parts of a trial as a pure function of nominal parts, seed and trial number.
 
-Read `Dispersion.apply` first. In trials of a run table, quantities with a column have the values of the table, and all
-others are random: `trial_setup` combines a row of the table with the dispersion of the campaign.
+Read `Dispersion.apply` first. In trials of a run table, quantities with a column have the values of the table. All
+others are random. `trial_setup` combines a row of the table with the dispersion of the campaign.
 """
 
 from collections.abc import Iterable, Mapping

@@ -147,14 +147,6 @@ class GravityTable(Attitude, DisturbanceTable, frozen=True):
                 f"{name}.sequence is {brief(self.sequence)}, but is allowed only together with euler_deg"
             )
 
-    def largest_frequency(self) -> float:
-        """Return 0, since an orbit is slow compared with the loop."""
-        return 0.0
-
-    def impulse(self, end: float) -> float:
-        """Return 0: the integral of the torque is neglected."""
-        return 0.0
-
     def bounds(self, scenario: Any) -> Bounds | None:
         """Return bounds of the torque 3 n^2 c x J c, where c is the unit vector to the central body.
 
