@@ -8,6 +8,7 @@ from typing import Any
 
 from ptsmc_jax.scenario import custom, epochs, errors, identify_tables, tables
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
+from ptsmc_jax.scenario.sensor_tables import SensorSuite
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.values import MOST_STEPS
 from ptsmc_jax.simulation import catalogues
@@ -90,6 +91,8 @@ def check_sensors(scenario: Scenario) -> None:
     if scenario.sensors is None:
         return
     scenario.require_sampled_loop("[sensors]")
+    if isinstance(scenario.sensors, SensorSuite):
+        scenario.sensors.check(scenario)
     for key in (*scenario.devices.noise_keys, *SENSOR_ERROR_KEYS, "star_tracker_every", "star_tracker_period"):
         value = getattr(scenario.hardware, key, None)
         if value is not None:

@@ -331,13 +331,11 @@ def _parse_sensor_suite(raw_sensors: Any, context: Context) -> Table:
         raise ScenarioError('[[sensors]] needs plant.kind = "spacecraft"; allowed is [sensors] with kind = "custom"')
     if not raw_sensors or not all(isinstance(one, Mapping) for one in raw_sensors):
         raise wrong("sensors", raw_sensors, "tables with a kind, [[sensors]] for each sensor")
-    suite = sensor_tables.SensorSuite(
+    return sensor_tables.SensorSuite(
         each=tuple(
             _parse_table(f"sensors[{k}]", one, sensor_tables.SENSORS, context) for k, one in enumerate(raw_sensors)
         )
     )
-    suite.check_alone()
-    return suite
 
 
 def _parse_dispersion(raw: Mapping[str, Any], struct: type[Table], context: Context) -> Table:

@@ -37,14 +37,11 @@ class SensorTable(PartTable, frozen=True):
 
     required: ClassVar[tuple[str, ...]] = ()  # keys without a default
 
-    def check_alone(self, place: str) -> None:
-        """Raise ScenarioError if a key is missing or keys contradict each other; place: place in the file."""
+    def check(self, place: str, scenario: Any) -> None:
+        """Raise ScenarioError if a key is missing, or if keys contradict each other; place: place in the file."""
         for key in self.required:
             if getattr(self, key) is None:
                 raise ScenarioError(f"{place}.{key} is absent, but must be given")
-
-    def check(self, place: str, scenario: Any) -> None:
-        """Raise ScenarioError if keys contradict other tables of the scenario; place: place in the file."""
 
 
 class AttitudeSensorTable(SensorTable, frozen=True):
@@ -59,15 +56,12 @@ class AttitudeSensorTable(SensorTable, frozen=True):
     ] = None
     latency: Annotated[NotNegative, Meaning("time from a reading until the flight software receives it", "s")] = 0.0
 
-    def check_alone(self, place: str) -> None:
-        """Raise ScenarioError also for two mountings or a zero boresight."""
-        super().check_alone(place)
+    def check(self, place: str, scenario: Any) -> None:
+        """Raise ScenarioError also for a wrong mounting, and for a sensor that is too fast, too slow, or very late."""
+        super().check(place, scenario)
         if self.boresight is not None and self.rotvec_deg is not None:
             raise wrong(f"{place}.rotvec_deg", self.rotvec_deg, "absent if boresight is given")
         attitude_keys.check_direction(f"{place}.boresight", self.boresight or (0.0, 0.0, 1.0))
-
-    def check(self, place: str, scenario: Any) -> None:
-        """Raise ScenarioError for a sensor that is faster than the loop, slower than the run, or very late."""
         control_period = scenario.loop.period
         if self.period is not None and self.period < control_period * (1.0 - WHOLE_TOLERANCE):
             raise wrong(f"{place}.period", self.period, f"at least loop.period, {control_period}")
@@ -123,7 +117,7 @@ class StarTracker(AttitudeSensorTable, frozen=True):
 
     def sigmas(self) -> tuple[float, ...]:
         """Return the noise about the x, y and z axis of the sensor [rad]."""
-        across = self.noise_across or 0.0  # `check_alone` refuses 0
+        across = self.noise_across or 0.0  # `check` refuses 0
         return across, across, self.noise_about or across
 
     def information(self) -> np.ndarray:
@@ -143,9 +137,9 @@ class VectorSensor(AttitudeSensorTable, frozen=True):
     noise: Annotated[Noise, Meaning("1 sigma of each component of the direction, in the sensor's axes", "rad")] = None
     required: ClassVar[tuple[str, ...]] = ("direction", "noise")
 
-    def check_alone(self, place: str) -> None:
+    def check(self, place: str, scenario: Any) -> None:
         """Raise ScenarioError also for a zero direction."""
-        super().check_alone(place)
+        super().check(place, scenario)
         attitude_keys.check_direction(f"{place}.direction", self.direction)
 
     def sigmas(self) -> tuple[float, ...]:
@@ -212,7 +206,7 @@ class Gyro(SensorTable, frozen=True):
     ] = 0.0
     rate_bias_walk: Annotated[Bias, Meaning("random walk of the bias", "rad/s/sqrt(s)")] = 0.0
 
-    def check_alone(self, place: str) -> None:
+    def check(self, place: str, scenario: Any) -> None:
         """Raise ScenarioError unless exactly one noise is given."""
         if self.rate_noise is None and self.rate_noise_density is None:
             raise ScenarioError(f"{place}.rate_noise is absent, but must be given, or rate_noise_density")
@@ -261,10 +255,10 @@ class SensorSuite(Table, frozen=True):
                 sensors[f"{kind}_{counts[kind]}"] = table
         return sensors
 
-    def check_alone(self) -> None:
+    def check(self, scenario: Any) -> None:
         """Raise ScenarioError if a sensor is not valid or if the sensors together do not determine the attitude."""
         for place, table in self.tables_by_name("sensors").items():
-            table.check_alone(place)
+            table.check(place, scenario)
         if not self.gyros:
             raise ScenarioError(
                 "[[sensors]] has no gyro, but must have one: the filter propagates the attitude with gyro readings"
@@ -276,11 +270,6 @@ class SensorSuite(Table, frozen=True):
                 "[[sensors]] does not determine the attitude, but must have a star tracker, or two vector sensors with "
                 "different directions"
             )
-
-    def check(self, scenario: Any) -> None:
-        """Raise ScenarioError if keys contradict other tables of the scenario."""
-        for place, table in self.tables_by_name("sensors").items():
-            table.check(place, scenario)
 
     def mean_gyro(self, period: float) -> tuple[float, float, float]:
         """Return noise [rad/s], bias [rad/s] and random walk of the bias [rad/s/sqrt(s)] of the mean of all gyros."""

@@ -351,8 +351,6 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         """Raise ScenarioError for modes that no body can have and for devices that contradict each other."""
         if self.flexible is not None:
             self.flexible.check(self.true_inertia)
-        if isinstance(self.sensors, SensorSuite):
-            self.sensors.check(self)
         self.devices.check(self)
         self.estimator.check(self)
         if self.wheels is not None:
