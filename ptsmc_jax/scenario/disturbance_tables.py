@@ -77,7 +77,7 @@ class DisturbanceTable(PartTable, frozen=True):
         if isinstance(self, Custom):
             return path_bounds(scenario, self.build(None, scenario), self.largest_frequency())
         numbers: Any = self
-        largest = np.abs(numbers.amplitude) * largest_factor(scenario)
+        largest = np.abs(numbers.amplitude) * (1.0 + largest_deviation(scenario, "disturbance_amplitude"))
         return Bounds(*self.part_class.bounds(msgspec.structs.replace(numbers, amplitude=largest)))
 
     def check(self, name: str, scenario: Any) -> None:
@@ -167,8 +167,7 @@ class GravityTable(Attitude, DisturbanceTable, frozen=True):
             rate, e = float(orbit.rate()), float(orbit.eccentricity)
         inertia = np.asarray(scenario.true_inertia, dtype=float)
         moments = np.sort(inertia) if inertia.ndim == 1 else np.linalg.eigvalsh(inertia)
-        inertia_dispersion = getattr(scenario.dispersion, "inertia", None)
-        deviation = 0.0 if inertia_dispersion is None else inertia_dispersion.largest
+        deviation = largest_deviation(scenario, "inertia")
         moment_difference = moments[2] * (1.0 + deviation) - moments[0] * (1.0 - deviation)
         factor = 3.0 * rate * rate * moment_difference / (1.0 - e) ** 3
         perigee_rate = rate * math.sqrt(1.0 + e) / (1.0 - e) ** 1.5
@@ -225,10 +224,6 @@ class SumDisturbance(Table, frozen=True):
         Meaning("the disturbances, each an inline table with its kind; required"),
     ] = ()
 
-    def fill_defaults(self, scenario: Any) -> Any:
-        """Return the table itself."""
-        return self
-
     def tables_by_name(self, name: str) -> dict[str, Any]:
         """Return the terms of the sum by their names in a file, such as disturbance.terms[0]."""
         return {f"{name}.terms[{k}]": term for k, term in enumerate(self.terms)}
@@ -279,19 +274,18 @@ def largest_disturbance(scenario: Any) -> tuple[float, float] | None:
         known = [term_bounds for term_bounds in bounds if term_bounds is not None]
         if len(known) < len(bounds):
             return None
-        bias = getattr(scenario.dispersion, "disturbance_bias", None)
-        largest_bias = 0.0 if bias is None else bias.largest
-        largest = sum((term_bounds.size for term_bounds in known), np.zeros(inputs)) + largest_bias
+        largest = sum((term_bounds.size for term_bounds in known), np.zeros(inputs))
+        largest += largest_deviation(scenario, "disturbance_bias")
         fastest = sum((term_bounds.rate for term_bounds in known), np.zeros(inputs))
     if not np.all(np.isfinite([largest, fastest])):
         raise ScenarioError("disturbance has an infinite amplitude or rate; allowed are smaller numbers in the table")
     return float(np.max(largest)), float(np.max(fastest))
 
 
-def largest_factor(scenario: Any) -> float:
-    """Return the largest random factor on the disturbance's amplitude."""
-    amplitude = getattr(scenario.dispersion, "disturbance_amplitude", None)
-    return 1.0 if amplitude is None else 1.0 + amplitude.largest
+def largest_deviation(scenario: Any, key: str) -> float:
+    """Return the largest deviation that bounds assume for a key of [dispersion], 0 if it is absent."""
+    table = getattr(scenario.dispersion, key, None)
+    return 0.0 if table is None else table.largest
 
 
 def observer_rate(scenario: Any) -> float:
@@ -363,7 +357,7 @@ def path_bounds(scenario: Any, signal: Any, fastest: float = 0.0) -> Bounds:
 
 def _extreme_disturbances(scenario: Any, signal: Any) -> list[Any]:
     """Return a custom disturbance with the smallest and the largest random amplitudes, at `PHASE_COUNT` phases."""
-    extremes, largest = [signal], largest_factor(scenario)
+    extremes, largest = [signal], 1.0 + largest_deviation(scenario, "disturbance_amplitude")
     amplitudes, phases = disturbances.values(signal, "amplitude"), disturbances.values(signal, "phase")
     if largest != 1.0 and amplitudes.size:
         extremes = [disturbances.with_values(signal, "amplitude", amplitudes * k) for k in (largest, 2.0 - largest)]

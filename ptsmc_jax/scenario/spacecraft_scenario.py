@@ -15,7 +15,7 @@ from ptsmc_jax.plants.flexible_body import flexible
 from ptsmc_jax.plants.rigid_body import AttitudeState, spacecraft
 from ptsmc_jax.scenario import attitude_keys, device_tables, dispersion_tables, errors, identify_tables, tables
 from ptsmc_jax.scenario.custom_devices import SENSORS
-from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES, SIGMAS
+from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES, SIGMAS, largest_deviation
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.law_tables import LAWS, OBSERVERS
 from ptsmc_jax.scenario.reference_tables import ORBITS, REFERENCES, Initial, OrbitTable
@@ -119,24 +119,18 @@ class Flexible(Table, frozen=True):
         except ValueError as error:
             raise ScenarioError(f"flexible.coupling is {errors.brief(self.coupling)}: {error}") from None
 
-    def check_random_modes(self, inertia: Any, dispersions: Any) -> None:
+    def check_random_modes(self, scenario: Any) -> None:
         """Raise ScenarioError if random couplings and inertias may be physically impossible.
 
         A random row of D is at most f times the nominal row, and a random moment at least s times the nominal moment.
         The inertia of the rigid rest of the body is then at least s J - f^2 D'D, which must be positive definite.
         Random rotations of the principal axes are not considered.
-
-        Args:
-            inertia: inertia of the true body [kg m^2].
-            dispersions: the table [dispersion].
         """
-        rows: Any = getattr(dispersions, "mode_coupling", None)
-        largest_factor = 1.0 if rows is None else 1.0 + rows.largest
-        smallest_moment = 1.0 - SIGMAS * getattr(getattr(dispersions, "inertia", None), "std", 0.0)
+        largest_factor = 1.0 + largest_deviation(scenario, "mode_coupling")
+        smallest_moment = 1.0 - SIGMAS * getattr(getattr(scenario.dispersion, "inertia", None), "std", 0.0)
+        inertia = smallest_moment * formulas.check_inertia(scenario.true_inertia)
         try:
-            formulas.rest_inertia(
-                smallest_moment * formulas.check_inertia(inertia), largest_factor * np.asarray(self.coupling)
-            )
+            formulas.rest_inertia(inertia, largest_factor * np.asarray(self.coupling))
         except ValueError as error:
             raise ScenarioError(
                 "dispersion.mode_coupling or dispersion.inertia is too large: a trial may have rows "
@@ -368,7 +362,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         if self.pointing is not None:
             self.pointing.check(self)
         if self.flexible is not None:
-            self.flexible.check_random_modes(self.true_inertia, self.dispersion)
+            self.flexible.check_random_modes(self)
 
     def check_reference_until(self, last: float) -> None:
         self.reference.check_reference_until(self, last, "tune.bounds.t_f")
@@ -422,8 +416,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         for key, rate in self._nutation_rates(setup).items():
             frequencies[key] = frequencies.get(key, 0.0) + rate
         if self.flexible is not None:
-            modes, dispersion = self.flexible, getattr(self.dispersion, "mode_frequency", None)
-            largest_factor = 1.0 if dispersion is None else 1.0 + dispersion.largest
+            modes, largest_factor = self.flexible, 1.0 + largest_deviation(self, "mode_frequency")
             inertia = np.asarray(setup.plant.inertia)
             fastest = formulas.free_mode_frequencies(inertia, modes.frequency, modes.coupling).max()
             frequencies["flexible.frequency"] = largest_factor * float(fastest)
