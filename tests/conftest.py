@@ -82,14 +82,17 @@ def _room_for_compiled_programs():
 
 
 @pytest.fixture
-def command(tmp_path, monkeypatch, capsys):
-    """Run `ptsmc ...` in an empty folder with the scenario `SHORT` as s.toml; return exit status, stdout and stderr."""
+def command(request, tmp_path, monkeypatch, capsys):
+    """Run `ptsmc ...` in a folder with s.toml only; return exit status, stdout and stderr.
+
+    The scenario s.toml is `SCENARIO` of the test module, or `SHORT`.
+    """
     from tests.helpers import SHORT
     from tuning.cli import main
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("ptsmc_jax.configure.configure", lambda **_: None)  # done above
-    (tmp_path / "s.toml").write_text(SHORT)
+    (tmp_path / "s.toml").write_text(getattr(request.module, "SCENARIO", SHORT))
 
     def run(*args):
         monkeypatch.setattr(sys, "argv", ["ptsmc", *map(str, args)])

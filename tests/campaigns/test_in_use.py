@@ -110,27 +110,26 @@ def test_a_lock_file_inside_the_folder_does_not_count_as_its_content(tmp_path, m
         pass
 
 
-SCENARIO = ("s.toml", "--quiet", "--no-figures")
+SCENARIO, ASKED = SHORT_CHAIN, ("s.toml", "--quiet", "--no-figures")
 
 
 @pytest.mark.parametrize(
     "asked",
     [
-        ("simulate", *SCENARIO),
-        ("map", *SCENARIO),
-        ("margins", *SCENARIO),
-        ("tune", *SCENARIO),
-        ("pareto", *SCENARIO),
-        ("montecarlo", *SCENARIO, "--trials", "10"),
-        ("montecarlo", *SCENARIO, "--trials", "10", "--shard", "1/2"),
-        ("montecarlo", *SCENARIO, "--trials", "10", "--dry-run"),
+        ("simulate", *ASKED),
+        ("map", *ASKED),
+        ("margins", *ASKED),
+        ("tune", *ASKED),
+        ("pareto", *ASKED),
+        ("montecarlo", *ASKED, "--trials", "10"),
+        ("montecarlo", *ASKED, "--trials", "10", "--shard", "1/2"),
+        ("montecarlo", *ASKED, "--trials", "10", "--dry-run"),
         ("export", "s.toml", "--quiet"),
         ("reproduce", "--quiet"),
     ],
     ids=" ".join,
 )
 def test_commands_do_not_write_into_a_folder_in_use(command, tmp_path, asked):
-    (tmp_path / "s.toml").write_text(SHORT_CHAIN)
     before = tree(tmp_path)
     with store.lock_folder(tmp_path / "out"):
         code, said, error = command(*asked, "--out", "out")
@@ -141,8 +140,7 @@ def test_commands_do_not_write_into_a_folder_in_use(command, tmp_path, asked):
 
 def test_shards_of_one_folder_run_at_the_same_time(command, tmp_path, monkeypatch):
     monkeypatch.setattr(campaign, "PART", 100)
-    (tmp_path / "s.toml").write_text(SHORT_CHAIN)
-    asked = ("montecarlo", *SCENARIO, "--trials", 110, "--out", "out")
+    asked = ("montecarlo", *ASKED, "--trials", 110, "--out", "out")
     with store.lock_folder(tmp_path / "out", shared=True):
         assert command(*asked, "--shard", "1/2") == command(*asked, "--shard", "2/2") == (0, "", "")
         assert command("summarize", "out", "--quiet", "--no-figures") == (0, "", "")
@@ -150,8 +148,7 @@ def test_shards_of_one_folder_run_at_the_same_time(command, tmp_path, monkeypatc
 
 
 def test_a_campaign_in_use_is_summarised_without_writing(command, tmp_path):
-    (tmp_path / "s.toml").write_text(SHORT_CHAIN)
-    asked = ("montecarlo", *SCENARIO, "--trials", "10", "--out", "out")
+    asked = ("montecarlo", *ASKED, "--trials", "10", "--out", "out")
     assert command(*asked) == (0, "", "")
     _, printed, _ = command("summarize", "out", "--no-figures")
     (tmp_path / "out" / "summary.json").unlink()

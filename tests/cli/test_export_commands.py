@@ -11,12 +11,7 @@ from ptsmc_jax.onboard import folder
 from tests.helpers import SHORT, SHORT_CHAIN, refused, tree
 from tests.onboard.compiled import needs_compiler
 
-CONTINUOUS = SHORT.replace('"sampled"', '"continuous"').split("[hardware]")[0]
-
-
-@pytest.fixture(autouse=True)
-def _of_a_chain(command, tmp_path):
-    (tmp_path / "s.toml").write_text(SHORT_CHAIN)
+SCENARIO, CONTINUOUS = SHORT_CHAIN, SHORT.replace('"sampled"', '"continuous"').split("[hardware]")[0]
 
 
 @pytest.fixture(scope="module")

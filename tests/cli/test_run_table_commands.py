@@ -11,13 +11,12 @@ from tests.helpers import SHORT_CHAIN, refused, rows_of
 from tests.output.pages import checked
 
 CORNERS = "initial_x1,initial_x2\n1.4,0.0\n1.0,0.02\n0.5,-0.02\n"
-CHAIN = SHORT_CHAIN.replace("[dispersion]", '[dispersion]\nstate_noise = { kind = "relative_normal" }')
+SCENARIO = SHORT_CHAIN.replace("[dispersion]", '[dispersion]\nstate_noise = { kind = "relative_normal" }')
 
 
 @pytest.fixture(autouse=True)
-def _small_parts_of_a_chain(monkeypatch, command, tmp_path):
+def _small_parts(monkeypatch):
     monkeypatch.setattr(campaign, "PART", 100)
-    (tmp_path / "s.toml").write_text(CHAIN)
 
 
 def test_run_table_of_a_dry_run_reproduces_the_campaign(command, tmp_path):
