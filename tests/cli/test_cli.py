@@ -8,18 +8,14 @@ import shutil
 import subprocess
 import sys
 import time
-from typing import Any
 
 import numpy as np
-import polars as pl
 import pytest
 
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo, runs
 from ptsmc_jax.scenario import timing
-from ptsmc_jax.simulation import catalogues, rollout
-from ptsmc_jax.simulation.metrics import Metrics
-from ptsmc_jax.theory import covariance, margins, run_margins
+from ptsmc_jax.simulation import catalogues
 from tests.helpers import PAPER_ATTITUDE, QUICKLY, ROOT, SHORT, SHORT_CHAIN, refused, short, small_search, tree
 from tests.output.pages import checked
 from tuning.output import formats
@@ -497,41 +493,6 @@ def test_simulate_refuses_a_nominal_initial_state_at_the_singularity(command, tm
     assert status == 2
     assert "initial.quat_xyzw is [1.0, 0.0, 0.0, 0.0]" in err
     assert command("simulate", "s.toml", "--trial", 0, "--no-figures", "--quiet")[0] in (0, 1)  # random initial state
-
-
-@pytest.fixture
-def cells(monkeypatch):
-    """Cells of a map with invented results. `tests/studies/test_mapping.py` computes real ones."""
-    metrics = Metrics(dict.fromkeys(catalogues.CATALOGUE, np.full(2, 1e-3)))
-    trials = montecarlo.Trials(np.arange(2), metrics, np.full(2, rollout.OK), np.full(2, np.nan), {})
-    ones: dict[str, Any] = dict.fromkeys(margins.Margins._fields, np.ones(1))
-    left = margins.Margins(**ones)
-    monkeypatch.setattr(montecarlo, "run", lambda *_: trials)
-    monkeypatch.setattr(run_margins, "margins_at_ends", lambda _: {"hand_over": (left, 0.9), "hold": (left, 0.9)})
-    monkeypatch.setattr(covariance, "propagate_noise", lambda _: covariance.Noise(5e-4, 2.0, 0.1))
-
-
-@pytest.mark.usefixtures("cells")
-def test_map_writes_its_result_folder(command, tmp_path):
-    (tmp_path / "c.toml").write_text(SHORT_CHAIN)
-    pairs = ("--x", "controller.eta=2.7:2.9:2", "--y", "controller.k1=0.8:1.6:2")  # one compiled program for all
-    status, out, _ = command("map", "c.toml", *pairs, "--trials", 2)
-    assert status == 0
-    assert "4 of 4 pairs simulated" in out
-    assert set(tree(tmp_path / "out" / "map-c")) == {"map.csv", "scenario.toml", "versions.json", "figures/map.png"}
-    again = "ptsmc map c.toml --x controller.eta=2.7:2.9:2 --y controller.k1=0.8:1.6:2 --trials 2"
-    read = checked(tmp_path / "out" / "map-c")
-    assert again in read.text
-    assert "linear_torque [u]" in read.text
-    cells = pl.read_csv(tmp_path / "out" / "map-c" / "map.csv")
-    assert cells["linear_window_error"].is_between(0.0, cells["window_error"], closed="none").all()  # noise only
-    assert "gain_margin [" not in read.text  # a factor without a unit
-    first = out.splitlines()[0]
-    assert first.startswith("the smallest RMS error is ")
-    assert read.text.index(first[1:]) < read.text.index("Pairs")
-    for bad in (("--x", "loop.period"), ("--trials", "0"), ("--x", "controller.k1=0.8:1.6:2"),
-                ("--x", "loop.perod=0.05:0.1:2")):  # fmt: skip
-        assert refused(command, tmp_path, "map", "c.toml", *pairs, "--out", "bad", *bad).startswith("ptsmc: ")
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")

@@ -17,8 +17,9 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.catalogues import CATALOGUE
 from ptsmc_jax.simulation.metrics import Metrics
-from ptsmc_jax.theory import linear, margins, run_margins
-from tests.helpers import ROOT
+from ptsmc_jax.theory import covariance, linear, margins, run_margins
+from tests.helpers import ROOT, refused, tree
+from tests.output.pages import checked
 from tuning.errors import UsageError
 from tuning.studies import mapping
 
@@ -148,6 +149,9 @@ def test_cells_agree_with_separate_simulations_of_their_pair(mapped, monkeypatch
             trials = montecarlo.run(alone.parts, alone.dispersion, 3, np.arange(6))
             np.testing.assert_allclose(cell.window_error, np.sqrt(np.mean(trials.metrics.window_error**2)), rtol=1e-9)
             np.testing.assert_allclose(cell.largest_peak_torque, trials.metrics.peak_torque.max(), rtol=1e-9)
+            noise = covariance.propagate_noise(alone.parts)
+            np.testing.assert_allclose(cell.linear_window_error, noise.window_error, rtol=1e-9)
+            np.testing.assert_allclose(cell.linear_torque, noise.torque, rtol=1e-9)
             at, seen = run_margins.margins_at, []
             monkeypatch.setattr(
                 run_margins, "margins_at", lambda *asked, at=at, seen=seen: seen.append(at(*asked)) or seen[0]
@@ -253,18 +257,36 @@ def test_stability_limits_are_drawn_over_period_and_delta_only():
     assert not mapping.stability_limit_curves(third, x, y)  # the formula is for plants of order 2
 
 
-def test_result_folder_of_a_map(mapped, tmp_path):
-    loaded, x, y, cells = mapped
-    mapping.write(tmp_path, mapping.Map(loaded, x, y, cells), 3, figures=True)
-    with (tmp_path / "map.csv").open() as file:
+def test_map_command_writes_its_result_folder(command, mapped, tmp_path):
+    loaded, _, _, cells = mapped
+    (tmp_path / "c.toml").write_text(CHAIN)
+    asked = ("map", "c.toml", "--x", "loop.period=0.05:0.2:2", "--y", "controller.delta=0.1:0.5:2")
+    status, out, _ = command(*asked, "--trials", 6, "--seed", 3)
+    assert status == 0
+    assert "3 of 4 pairs simulated" in out
+    folder = tmp_path / "out" / "map-c"
+    assert set(tree(folder)) == {"map.csv", "scenario.toml", "versions.json", "figures/map.png"}
+    with (folder / "map.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [float(row["loop.period"]) for row in rows] == [c.x for c in cells]
-    assert rows[0]["status"] == "simulated"
-    assert float(rows[0]["window_error"]) == cells[0].window_error
+    assert [row["status"] for row in rows] == [c.status for c in cells]
+    for name in ("window_error", "linear_window_error", "hold_delay_margin"):
+        values = [float(row[name] or "nan") for row in rows]
+        np.testing.assert_array_equal(values, [getattr(c, name) for c in cells], name)
     assert rows[1]["window_error"] == ""  # refused
-    assert (tmp_path / "figures" / "map.png").stat().st_size > 10_000
-    assert json.loads((tmp_path / "versions.json").read_text())["command"] == "map"
-    assert scenario.read(tmp_path / "scenario.toml") == loaded
+    assert (folder / "figures" / "map.png").stat().st_size > 10_000
+    assert json.loads((folder / "versions.json").read_text())["command"] == "map"
+    assert scenario.read(folder / "scenario.toml") == loaded
+    read = checked(folder)
+    assert f"ptsmc {' '.join(asked)} --trials 6 --seed 3" in read.text
+    assert "linear_torque [u]" in read.text
+    assert "gain_margin [" not in read.text  # a factor without a unit
+    first = out.splitlines()[0]
+    assert first.startswith("the smallest RMS error is ")
+    assert read.text.index(first[1:]) < read.text.index("Pairs")
+    for bad in (("--x", "loop.period"), ("--trials", "0"), ("--x", "controller.delta=0.1:0.5:2"),
+                ("--x", "loop.perod=0.05:0.1:2")):  # fmt: skip
+        assert refused(command, tmp_path, *asked, "--out", "bad", *bad).startswith("ptsmc: ")
 
 
 FLEXIBLE = """
