@@ -1,8 +1,11 @@
+import math
 import tomllib
 from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +16,7 @@ import pytest
 from ptsmc_jax import configure, scenario
 from ptsmc_jax.campaigns import campaign, montecarlo, rows, runs
 from ptsmc_jax.simulation.metrics import Metrics
+from ptsmc_jax.theory import lower_bound
 from tests.helpers import SHORT, SHORT_CHAIN, same, short, untuned
 
 
@@ -37,12 +41,6 @@ def test_row_has_all_results_and_inputs_of_its_trial(simulated):
     for name, value in run.metrics.items():
         row = frame[name][250]
         assert row is None if np.isnan(value) else row == pytest.approx(value, rel=1e-12), name
-
-
-@pytest.mark.parametrize(("first", "count"), [(0, 1), (7, 63), (44, 256)])
-def test_rows_do_not_depend_on_the_parts(simulated, first, count):
-    made, frame = simulated
-    same(made.simulate(range(first, first + count)), frame[first : first + count])
 
 
 BLOCKS = [(128, 4096, 1), (16, 4096, 2), (64, 128, 2), (32, 64, 1)]
@@ -82,6 +80,8 @@ def test_failed_trials_do_not_affect_the_others():
     lost = bad.filter(pl.col("effort").is_null())
     assert lost.height > 0
     assert lost["saturated"].null_count() == lost.height  # no finite command, so no fraction of time in saturation
+    counts = montecarlo.run(made.ready.parts, made.ready.dispersion, 0, np.arange(600)).counts()
+    assert counts == {**dict.fromkeys(counts, 0), **dict(frame["status"].value_counts().rows())}
     good = frame.filter(~pl.col("status").is_in(["diverged", "singular"]))
     alone = montecarlo.run(made.ready.parts, made.ready.dispersion, 0, good["trial"].to_numpy())
     for name in made.ready.catalogue:
@@ -245,3 +245,34 @@ def test_missing_values_are_null_in_both_precisions(monkeypatch, kind):
     monkeypatch.setattr(montecarlo, "run", lambda *_, **__: as_kind)
     frame = made.simulate(range(5))
     assert [frame[name].null_count() for name in ("bad_time", "settling_time", "window_error")] == [5, 5, 0]
+
+
+@pytest.mark.parametrize(("varies", "rows", "simulated"), [
+    (True, (), [0, 1, 2, 3]), (False, (), [None]), (True, (7, 9), [7, 9]), (False, (7,), [7]),
+])  # fmt: skip
+def test_lower_bound_is_pooled_over_the_first_trials_or_rows(monkeypatch, varies, rows, simulated):
+    """Trial k has the lower bound k + 1. The second simulated trial fails and has no bound."""
+    seen: list[Any] = []
+
+    def fly(ready, seed, trial):
+        seen.append((seed, trial))
+        return SimpleNamespace(has_lower_bound=len(seen) != 2, parts=1.0 + (trial or 0), log=None)
+
+    def along_each(simulated):
+        return [lower_bound.LowerBound(bound, np.zeros(1), np.zeros(1)) for bound, _ in simulated]
+
+    monkeypatch.setattr(runs, "_simulate_without_margins", fly)
+    monkeypatch.setattr(lower_bound, "bounds_along_runs", along_each)
+    ready: Any = SimpleNamespace(dispersion=SimpleNamespace(varies=varies))
+    squares = [(1.0 + (k or 0)) ** 2 for j, k in enumerate(simulated) if j != 1]
+    assert runs.rms_lower_bound(ready, 5, rows) == pytest.approx(math.sqrt(sum(squares) / len(squares)))
+    assert seen == [(5, k) for k in simulated]
+
+
+@pytest.mark.parametrize("status", ["not_converged", "singular", "diverged"])
+def test_failed_run_is_not_met_even_without_requirements(status):
+    """`ptsmc simulate` then has exit status 1."""
+    none: Any = None
+    run = runs.Run(none, none, {}, {}, "ok", "", math.nan, [], {})
+    assert run.met
+    assert not replace(run, status=status).met

@@ -289,18 +289,16 @@ def test_evaluator_appends_margins_of_the_hardest_trials(drawn, monkeypatch):
 
 def test_prepared_margin_program_is_the_program_of_the_search(drawn, monkeypatch):
     """A program with other shapes or types would be compiled in vain."""
-    posed, prepared = drawn, []
-    monkeypatch.setattr(margin_rows.constraints_on_devices, "prepare", lambda *given: prepared.append(given))
     monkeypatch.setattr(margin_rows, "select_hardest_trials", lambda asked, _: (asked, 0.0))
-    bounds = posed.evaluate.bounds
-    margin_rows.build_required_margins(posed.ready, bounds, 3)
-    known = [(jax.tree.structure(given), [jax.typeof(leaf) for leaf in jax.tree.leaves(given)]) for given in prepared]
-    asked = (
-        posed.problem.margins,
-        bounds.scale,
-        np.stack([bounds.normalise(posed.scenario_gains)] * len(jax.local_devices())),
+    bounds = drawn.evaluate.bounds
+    points = np.stack([bounds.normalise(drawn.scenario_gains)] * len(jax.local_devices()))
+    assert_prepared(
+        monkeypatch,
+        margin_rows,
+        "constraints_on_devices",
+        lambda: margin_rows.build_required_margins(drawn.ready, bounds, 3),
+        lambda: margin_rows.constraints_on_devices(drawn.problem.margins, bounds.scale, points),
     )
-    assert known == [(jax.tree.structure(asked), [jax.typeof(leaf) for leaf in jax.tree.leaves(asked)])]
 
 
 @pytest.mark.parametrize(

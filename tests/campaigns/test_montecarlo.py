@@ -5,7 +5,7 @@ import pytest
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.simulation import rollout
-from tests.helpers import FIRST_FLIGHT, SHORT_CHAIN, assert_prepared, random_turns, short, untuned
+from tests.helpers import FIRST_FLIGHT, SHORT_CHAIN, assert_prepared, short, untuned
 
 # eta, delta [s], observer gain: RMS window error and mean peak torque [N m], without and with noise (theory notes, 6)
 TABLE = (
@@ -15,7 +15,6 @@ TABLE = (
     (5.0, 0.5, 10.0, (2.7e-5, 0.45), (4.3e-5, 0.45)),
     (4.0, 1.0, 40.0, (1.3e-5, 0.29), (1.5e-5, 0.29)),
 )
-SPREAD = random_turns(np.deg2rad(20.0), np.deg2rad(140.0))
 
 
 # on the flight clock, one compiled program simulates all gains
@@ -89,21 +88,6 @@ def test_a_trial_does_not_depend_on_the_others(chain, simulated):
     np.testing.assert_allclose(again.vectors("initial_x"), simulated.vectors("initial_x")[some], atol=1e-15)
     other = montecarlo.run(chain.parts, chain.dispersion, 6, some)
     assert not np.any(other.metrics.window_error == again.metrics.window_error)
-
-
-def test_failed_trials_are_counted_and_do_not_affect_others():
-    """The numbers of trials are at least `FEW`, so that the program for many trials is tested."""
-    run = scenario.study(FIRST).parts
-    trials = montecarlo.run(run, SPREAD, 5, np.arange(256))
-    wide = random_turns(np.deg2rad(20.0), np.pi)
-    near = random_turns(np.pi - 1e-4, np.pi)
-    failed = montecarlo.run(run, near, 5, np.arange(montecarlo.FEW))
-    assert failed.counts() == {"ok": 0, "diverged": 0, "singular": montecarlo.FEW, "not_converged": 0, "incomplete": 0}
-    assert np.all(failed.bad_time >= 0.0)
-    mixed = montecarlo.run(run, wide, 5, np.arange(256))
-    assert sum(mixed.counts().values()) == 256
-    assert np.all(np.isfinite(mixed.metrics.window_error[mixed.ok]))
-    assert trials.counts() == {"ok": 256, "diverged": 0, "singular": 0, "not_converged": 0, "incomplete": 0}
 
 
 @pytest.mark.parametrize(("eta", "delta", "gain", "quiet", "noisy"), short(TABLE, TABLE[::4]))
