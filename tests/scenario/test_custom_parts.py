@@ -4,14 +4,14 @@ import importlib.util
 import py_compile
 import shutil
 from pathlib import Path
+from typing import Any
 
 import polars as pl
 import pytest
 
 from ptsmc_jax import scenario
-from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.store import RefusedError
-from ptsmc_jax.scenario import parsing, systems
+from ptsmc_jax.scenario import custom, parsing, systems
 from ptsmc_jax.scenario.errors import ScenarioError
 from tests.helpers import refused
 from tuning.search import custom_parts
@@ -243,13 +243,6 @@ def test_a_custom_file_runs_again_only_if_it_has_changed(tmp_path):
         systems.load(f"{file}:mine")
 
 
-def test_a_run_records_the_checksum_of_its_custom_file(command, tmp_path):
-    (tmp_path / "my.py").write_text(PROGRAM)
-    (tmp_path / "mine.toml").write_text(SCENARIO)
-    assert command("simulate", "mine.toml", "--out", "run", "--quiet", "--no-figures")[0] == 0
-    assert store.read_versions(tmp_path / "run")["system_sha256"] == systems.checksum(f"{tmp_path}/my.py:mine")
-
-
 @pytest.mark.parametrize(
     ("name", "text"),
     [
@@ -319,3 +312,60 @@ def test_a_custom_file_with_local_imports_is_not_copied(tmp_path, text, carried)
     where = f"{tmp_path}/mine.py:Law"
     assert custom_parts.copy_custom_files(_tables(where), made) == _tables("mine.py:Law" if carried else where)
     assert [path.name for path in made.iterdir()] == (["mine.py"] if carried else [])
+
+
+def test_a_symbolic_link_in_results_to_an_outside_file_belongs_to_the_results(tmp_path):
+    results, mine = tmp_path / "results", tmp_path / "mine" / "deep" / "mine.toml"
+    for place in (results, mine.parent):
+        place.mkdir(parents=True)
+    (results / "versions.json").write_text("{}")
+    mine.write_text("")
+    (results / "tuned.toml").symlink_to(mine)
+    assert custom_parts.find_results_folder(results / "tuned.toml") == results
+    assert custom_parts.find_results_folder(mine) is None
+
+
+def test_a_file_named_by_several_keys_is_reported_once(tmp_path, capsys):
+    law = tmp_path / "mine.py"
+    law.write_text("")
+    programs: Any = dict.fromkeys(("controller.code", "observer.code", "reference.code"), f"{law}:Mine")
+    with pytest.raises(
+        RefusedError, match=rf"custom code, {law} \(controller.code, observer.code, reference.code\), which"
+    ):
+        custom_parts.allow_results(programs, tmp_path, {}, trusted=False)
+    checksums = {custom.checksum_name(key): systems.checksum(where) for key, where in programs.items()}
+    custom_parts.allow_results(programs, tmp_path, checksums, trusted=True)
+    keys = "controller.code, observer.code and reference.code"
+    assert capsys.readouterr().err == f"ptsmc: runs {law}, which {keys} of {tmp_path} name\n"
+
+
+def test_a_program_without_a_checksum_in_the_results_is_reported(tmp_path, capsys):
+    law, other = tmp_path / "mine.py", tmp_path / "other.py"
+    law.write_text("")
+    other.write_text("")
+    programs = {"controller.code": f"{law}:Mine", "observer.code": f"{other}:Mine"}
+    made = {"controller_sha256": systems.checksum(f"{law}:Mine")}
+    assert custom_parts.check_unchanged(programs, tmp_path, made) == ["observer.code"]
+    custom_parts.allow_results(programs, tmp_path, made, trusted=True)
+    (said,) = [line for line in capsys.readouterr().err.splitlines() if "no checksum" in line]
+    assert str(other) in said
+    assert str(law) not in said
+
+
+def test_checksum_covers_imported_files_in_the_same_folder(tmp_path):
+    """A campaign could otherwise resume after a change of an imported file, and mix rows of both versions."""
+    (tmp_path / "package").mkdir()
+    files = {"mine.py": "import helper\n", "helper.py": "from package.inner import f\n", "package/inner.py": "f = 1\n"}
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    (tmp_path / "other.py").write_text("")
+    where = f"{tmp_path}/mine.py:Mine"
+    known = [systems.checksum(where)]
+    for name, text in files.items():
+        (tmp_path / name).write_text(f"{text}# changed\n")
+        known.append(systems.checksum(where))
+    assert len(set(known)) == 4
+    (tmp_path / "other.py").write_text("x = 1\n")
+    assert systems.checksum(where) == known[-1]
+    with pytest.raises(RefusedError, match=r"was made with another controller\.code"):
+        custom_parts.check_unchanged({"controller.code": where}, tmp_path, {"controller_sha256": known[0]})

@@ -9,7 +9,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.requirements import Requirement
-from tests.helpers import short, ticks_of, vector
+from tests.helpers import short
 from tuning.search import design
 from tuning.search.gains import in_scenario, with_gains
 
@@ -160,17 +160,6 @@ def test_the_bracket_is_halved_if_peaks_hardly_decrease_with_t_f():
     for start in (60.0, 10.0):
         found = design._shortest_t_f(lambda t: 1.0 + 1e-6 * (30.0 - t), 1.0, start, 1.0, 100.0, 1e-3, 60)
         assert found == pytest.approx(30.0, rel=1e-3)
-
-
-def test_setting_t_f_changes_only_the_times_that_depend_on_it():
-    parts = scenario.study(scenario.from_tables(CASE)).parts
-    moved = with_gains(parts, {"t_f": 15.0})
-    assert (float(moved.controller.t_f), float(moved.t_end), float(moved.clock.t_end)) == (15.0, 17.0, 17.0)
-    back = replace(with_gains(moved, {"t_f": 20.0}), initial=parts.initial)
-    assert float(back.t_end) == float(parts.t_end)
-    np.testing.assert_array_equal(
-        ticks_of(back.clock, vector(20.0), vector(1.0)).t, ticks_of(parts.clock, vector(20.0), vector(1.0)).t
-    )
 
 
 SPINNING = {

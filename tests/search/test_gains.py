@@ -17,7 +17,6 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.gain_bounds import BoundsContext
 from ptsmc_jax.scenario.law_tables import LAWS, OBSERVERS
 from ptsmc_jax.simulation import rollout
-from ptsmc_jax.theory import stability_limits
 from tests.helpers import FIRST_FLIGHT, finer, short, ticks_of, vector
 from tuning.search import gains, normalisation
 from tuning.studies import judging, posing
@@ -135,20 +134,9 @@ def test_filter_gains_are_differentiable_with_respect_to_the_bandwidth():
         assert np.all(np.isfinite(spread(at)))
 
 
-@pytest.mark.parametrize(("interval", "highest"), [(0.1, 5.0), (0.4, 2.5), (8.0, 1.0)])
-def test_default_bounds_of_the_filter_bandwidth_depend_on_the_star_tracker_period(interval, highest):
-    """They are a tenth to ten times 0.5 rad/s, with an upper bound of 1 / interval but at least twice the bandwidth."""
-    hardware = {"attitude_noise": 2e-5, "rate_noise": 1e-6, "star_tracker_period": interval}
-    tables = {"loop": {"mode": "sampled", "period": 0.1}, "filter": {"kind": "steady_state", "bandwidth": 0.5}}
-    made = from_tables({**tables, "hardware": hardware, "tune": {"free": ["filter_bandwidth"]}})
-    np.testing.assert_allclose(made.search.bounds["filter_bandwidth"], (0.05, highest), rtol=1e-12)
-
-
 def test_bounds_of_the_command_filter_corner_must_be_below_the_nyquist_frequency():
-    """The default bounds are a tenth and ten times the corner of 0.5 rad/s."""
     device, free = {"kind": "first_order", "corner": 0.5}, {"free": ["command_corner"]}
     tables = {"loop": {"mode": "sampled", "period": 0.1}, "hardware": {"command_filter": device}}
-    assert from_tables({**tables, "tune": free}).search.bounds == {"command_corner": (0.05, 5.0)}
     wide = {**free, "bounds": {"command_corner": [1e-3, 31.4]}}
     assert from_tables({**tables, "tune": wide}).search.bounds == {"command_corner": (1e-3, 31.4)}
     for bounds in ([0.0, 3.0], [0.5, 31.5]):
@@ -196,68 +184,67 @@ def test_gains_of_a_chain_and_its_observer_are_set_in_parts(kind):
     np.testing.assert_allclose(one.window_error, other.window_error, rtol=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("inertia", "t_f", "gain", "expected"),
-    [
-        ([10.0, 12.0, 14.0], 30.0, 10.0, (0.6, 360.0)),
-        ([10.0, 12.0, 14.0], 60.0, 10.0, (0.3, 180.0)),
-        ([0.01, 0.012, 0.014], 30.0, 0.01, (0.0006, 0.36)),
-        ([[1e7, 3e6, -2e6], [3e6, 2e7, 1e6], [-2e6, 1e6, 1.5e7]], 30.0, 1e7, (7.5e5, 4.5e8)),
-        ([10.0, 12.0, 14.0], 30.0, 0.1, (0.05, 360.0)),  # the bounds include the scenario's gain
-        ([10.0, 12.0, 14.0], 30.0, 500.0, (0.6, 1000.0)),
+SAMPLED = {"mode": "sampled"}
+
+
+def filtered(interval):
+    hardware = {"attitude_noise": 2e-5, "rate_noise": 1e-6, "star_tracker_period": interval}
+    return {"loop": {**SAMPLED, "period": 0.1}, "hardware": hardware, "filter": {"bandwidth": 0.5}}
+
+
+def timed(t_f, **gains):
+    return {"controller": {"t_f": t_f, **gains}}
+
+
+INERTIA = [[1e7, 3e6, -2e6], [3e6, 2e7, 1e6], [-2e6, 1e6, 1.5e7]]
+DEFAULT_BOUNDS = {
+    "observer_gain": [  # 1.5 / t_f and 900 / t_f times the mean moment of inertia, including the scenario's gain
+        (timed(30.0), (0.6, 360.0)),
+        (timed(60.0), (0.3, 180.0)),
+        ({**timed(30.0), "spacecraft": {"inertia": INERTIA}, "observer": {"gain": [1e7] * 3}}, (7.5e5, 4.5e8)),
+        ({**timed(30.0), "observer": {"gain": [0.1] * 3}}, (0.05, 360.0)),
+        ({**timed(30.0), "observer": {"gain": [500.0] * 3}}, (0.6, 1000.0)),
     ],
-)
-def test_default_bounds_of_the_observer_gain_scale_with_inertia_and_time(inertia, t_f, gain, expected):
-    """They are 1.5 / t_f and 900 / t_f times the mean moment of inertia, and include the scenario's gain."""
-    tables = {"spacecraft": {"inertia": inertia}, "observer": {"gain": [gain] * 3}, "tune": {}}
-    made = from_tables({**tables, "controller": {"t_f": t_f}, "disturbance": {"kind": "none"}})
-    assert made.tune is not None
-    np.testing.assert_allclose(made.tune.bounds["observer_gain"], expected, rtol=1e-12)
-
-
-def test_default_bounds_of_delta_and_k1_scale_with_t_f():
-    """Delta is searched from t_f / 600 to t_f / 4, and K1 from 3.5 / t_f to 350 / t_f.
-
-    The bounds include the scenario's gain: delta at 3.5 s and K1 at 4000 s lie outside the usual ones.
-    """
-    made = {}
-    for t_f, delta, k1 in ((3.5, 0.0035, 8.0), (35.0, 0.35, 1.0), (4000.0, 40.0, 1.0)):
-        law = {"t_f": t_f, "delta": delta, "k1": k1, "error": "multiplicative"}
-        tune = {"free": ["delta", "k1"]}
-        one = from_tables({"controller": law, "loop": {"t_end": t_f + 10.0, "window": 1.0}, "tune": tune})
-        assert one.tune is not None
-        made[t_f] = one.tune.bounds
-    np.testing.assert_allclose(made[3.5]["delta"], (0.00175, 3.5 / 4.0))
-    np.testing.assert_allclose(made[35.0]["delta"], (35.0 / 600.0, 35.0 / 4.0))
-    np.testing.assert_allclose(made[4000.0]["delta"], (4000.0 / 600.0, 1000.0))
-    np.testing.assert_allclose(made[3.5]["k1"], (1.0, 100.0))
-    np.testing.assert_allclose(made[35.0]["k1"], (0.1, 10.0))
-    np.testing.assert_allclose(made[4000.0]["k1"], (3.5 / 4000.0, 2.0))
-
-
-@pytest.mark.parametrize(
-    ("period", "t_f", "expected"),
-    [
-        (0.05, 35.0, (0.05, 20.0)),
-        (None, 35.0, (0.05, 10.0)),
-        (0.5, 35.0, (0.05, 2.0)),
-        (0.05, 3500.0, (0.0005, 20.0)),
+    "delta": [  # t_f / 600 to t_f / 4, including the scenario's delta
+        (timed(3.5, delta=0.0035), (0.00175, 3.5 / 4.0)),
+        (timed(35.0, delta=0.35), (35.0 / 600.0, 35.0 / 4.0)),
+        (timed(4000.0, delta=40.0), (4000.0 / 600.0, 1000.0)),
     ],
-)
-def test_default_bounds_of_surface_rate_begin_at_1_75_over_t_f_and_end_at_half_of_the_stability_limit(
-    period, t_f, expected
-):
-    loop = {"t_end": t_f + 10.0, "window": 1.0}
-    if period is not None:
-        loop |= {"mode": "sampled", "period": period}
-    law = {"t_f": t_f, "delta": 0.5, "error": "multiplicative"}
-    made = from_tables({"controller": law, "loop": loop, "tune": {"free": ["surface_rate"]}})
-    assert made.tune is not None
-    np.testing.assert_allclose(made.tune.bounds["surface_rate"], expected)
-    if period is not None:  # the stability limit itself, without K1 and the switching term
-        for c, stable in ((1.999 / period, True), (2.001 / period, False)):
-            kp, kd = stability_limits.gains(np.asarray(t_f), t_f, 3.0, 0.5, 0.0, 0.0, c)
-            assert (stability_limits.spectral_radius(float(kp) + 1e-9, float(kd), period) < 1.0) == stable
+    "k1": [  # 3.5 / t_f to 350 / t_f, including the scenario's K1
+        (timed(3.5, k1=8.0), (1.0, 100.0)),
+        (timed(35.0, k1=1.0), (0.1, 10.0)),
+        (timed(4000.0, k1=1.0), (3.5 / 4000.0, 2.0)),
+    ],
+    "surface_rate": [  # 1.75 / t_f to half of the stability limit
+        ({**timed(35.0, delta=0.5), "loop": {**SAMPLED, "period": 0.05}}, (0.05, 20.0)),
+        ({**timed(35.0, delta=0.5), "loop": {**SAMPLED, "period": 0.5}}, (0.05, 2.0)),
+        ({**timed(3500.0, delta=0.5), "loop": {**SAMPLED, "period": 0.05}}, (0.0005, 20.0)),
+        (timed(35.0, delta=0.5), (0.05, 10.0)),
+    ],
+    "eta": [  # which must exceed 2: a bound beyond the scenario's eta is at twice or half its distance from 2
+        ({"controller": {"eta": 12.0}}, (2.05, 22.0)),
+        ({"controller": {"eta": 2.03}}, (2.015, 8.0)),
+    ],
+    "t_f": [  # t_f / 2 to 2 t_f, but at least 1.05 times the convergence time t_o of the observer
+        ({**timed(30.0), "observer": {"kind": "prescribed_time", "t_o": 1.0}}, (15.0, 60.0)),
+        ({**timed(30.0), "observer": {"kind": "prescribed_time", "t_o": 20.0}}, (21.0, 60.0)),
+    ],
+    "filter_bandwidth": [  # to ten times the bandwidth, at most 1 / interval, but at least twice the bandwidth
+        (filtered(0.1), (0.05, 5.0)),
+        (filtered(0.4), (0.05, 2.5)),
+        (filtered(8.0), (0.05, 1.0)),
+    ],
+    "command_corner": [
+        ({"loop": SAMPLED, "hardware": {"command_filter": {"kind": "first_order", "corner": 0.5}}}, (0.05, 5.0))
+    ],
+}
+
+
+@pytest.mark.parametrize("name", DEFAULT_BOUNDS)
+def test_default_bounds(name):
+    for tables, expected in DEFAULT_BOUNDS[name]:
+        made = from_tables({**tables, "tune": {"free": [name]}})
+        np.testing.assert_allclose(made.search.bounds[name], expected, rtol=1e-12, err_msg=str(tables))
 
 
 @pytest.mark.parametrize(
@@ -279,21 +266,6 @@ def test_default_bounds_contain_the_gain_of_the_scenario(law, gain, value):
     assert made.tune is not None
     low, high = made.tune.bounds[gain]
     assert low < value < high
-
-
-@pytest.mark.parametrize(("eta", "expected"), [(12.0, (2.05, 22.0)), (2.03, (2.015, 8.0))])
-def test_default_bounds_of_eta_are_relative_to_its_smallest_allowed_value(eta, expected):
-    """eta must exceed 2. A bound beyond the scenario's eta is at twice or half its distance from 2."""
-    made = from_tables({"controller": {"eta": eta}, "tune": {"free": ["eta"]}})
-    np.testing.assert_allclose(made.search.bounds["eta"], expected, rtol=1e-12)
-
-
-@pytest.mark.parametrize(("t_o", "shortest"), [(1.0, 15.0), (20.0, 21.0)])
-def test_default_bounds_of_t_f_exceed_the_observer_time(t_o, shortest):
-    """The lower bound is t_f / 2, or 1.05 times the convergence time t_o of the observer if that is larger."""
-    observer = {"kind": "prescribed_time", "t_o": t_o}
-    made = from_tables({"controller": {"t_f": 30.0}, "observer": observer, "tune": {"free": ["t_f"]}})
-    np.testing.assert_allclose(made.search.bounds["t_f"], (shortest, 60.0), rtol=1e-12)
 
 
 @pytest.mark.parametrize("delta", [0.02, 0.05])
