@@ -201,14 +201,6 @@ def test_the_default_observer_gain_depends_on_inertia_and_period():
     assert gains.published_gains(cubesat)["observer_gain"] == cubesat_gain
 
 
-def test_the_observer_gain_scales_with_the_inverse_of_t_f():
-    """In the continuous loop, l / J is 10 / 12 1/s at t_f = 30 s, and 10 1/s for a chain at t_f = 5 s."""
-    body = scenario.from_tables({"controller": {"t_f": 120.0}})
-    assert body.observer.gain == pytest.approx((2.5, 2.5, 2.5), rel=1e-12)
-    chain = {"plant": {"kind": "chain"}, "observer": {"kind": "nonlinear"}, "controller": {"t_f": 20.0}}
-    assert scenario.from_tables(chain).observer.gain == pytest.approx((2.5,), rel=1e-12)
-
-
 def test_stated_disturbance_bounds_are_kept():
     given = {"disturbance_rate_bound": 2e-3, "disturbance_bound": 0.0}
     assert bounds(controller=given) == (0.0, 2e-3)
