@@ -1,12 +1,17 @@
-"""Requirements on fractions of time in the summary and the figures of a campaign."""
+"""Requirements on fractions of time, lower bound and margins in the summary and the figures of a campaign."""
+
+import json
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import polars as pl
 import pytest
 
+from ptsmc_jax.campaigns import margin_verdicts, runs
 from ptsmc_jax.figures.campaign_plots import AT_TIMES, BEYOND
 from ptsmc_jax.simulation.requirements import Requirement
-from tuning.studies import campaign_figures, campaign_summary
+from tuning.studies import campaign_figures, campaign_summary, campaign_theory
 
 # one run keeps the limit, two violate it for 10 % and 50 % of the time, and one diverges
 FRAME = pl.DataFrame({
@@ -71,3 +76,29 @@ def test_worst_trials_by_successful_samples_have_the_fewest():
     counts, none = np.array([65, 31, 40]), np.zeros(3, bool)
     assert campaign_summary.most_extreme("controller_ok", counts, none, 2).tolist() == [1, 2]
     assert campaign_summary.most_extreme("controller_other", counts, none, 2).tolist() == [0, 2]
+
+
+@pytest.mark.parametrize(("count", "rows", "looked"), [(None, [], None), (3, [0, 1, 2], 3), (900, [0, 1, 2, 3], 256)])
+def test_bound_and_margins_use_the_first_trials_and_are_computed_once(tmp_path, monkeypatch, count, rows, looked):
+    """A run table has the lower bound of at most its first 4 rows, and the margins of at most its first 256 rows."""
+    asked: list[Any] = []
+
+    def lower_bound(ready, seed, first):
+        asked.append((ready, seed, first))
+        return 1e-6
+
+    def of_trials(ready, seed, some):
+        asked.append((ready, seed, None if some is None else len(some)))
+        return []
+
+    monkeypatch.setattr(runs, "rms_lower_bound", lower_bound)
+    monkeypatch.setattr(margin_verdicts, "judge_trials", of_trials)
+    table = SimpleNamespace(count=count, row=lambda k, seed: (k, seed), rows=lambda numbers, seed: np.asarray(numbers))
+    simulated = SimpleNamespace(ready="ready", run_table=None if count is None else table)
+    folder: Any = SimpleNamespace(path=tmp_path, seed=7, campaign=simulated, scenario=SimpleNamespace(requirements={}))
+    campaign_theory.write_missing(folder)
+    assert asked == [("ready", 7, looked), ("ready", 7, [(k, 7) for k in rows])]
+    assert json.loads((tmp_path / "theory.json").read_text()) == {"lower_bound": 1e-6, "margins": []}
+    campaign_theory.write_missing(folder)
+    assert len(asked) == 2
+    assert campaign_theory.read_lower_bound(folder) == 1e-6
