@@ -169,19 +169,11 @@ def test_mean_bound_exceeds_the_student_bound_by_at_most_3_over_n():
             assert students < statistics.mean_bound(fractions, 0.95) < students + 3.0 / runs
 
 
-def test_percentile_of_equal_values_is_their_mean_rank():
-    """Regression: a value that nearly all rows of a run table had was reported as extreme, "at 80 %"."""
-    assert statistics.percentile(np.array([1.0, 2.0, 3.0, 4.0]), 4.0) == 100.0
-    assert statistics.percentile(np.array([10.0, 10.0, 10.0, 10.0, np.inf]), 10.0) == 50.0
-
-
 @pytest.mark.parametrize("seed", range(20))
 def test_statistics_equal_scipy_stats(seed):
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 3000))
-    k, quantile, confidence = int(rng.integers(1, n + 1)), rng.uniform(), rng.uniform(0.5, 0.9999)
-    bound = stats.beta.ppf(1.0 - confidence, k, n - k + 1)
-    np.testing.assert_allclose(statistics.fraction_bound(k, n, confidence), bound, rtol=1e-12)
+    quantile, confidence = rng.uniform(), rng.uniform(0.5, 0.9999)
     low, high = (
         stats.binom.ppf((1.0 - confidence) / 2.0, n, quantile),
         stats.binom.isf((1.0 - confidence) / 2.0, n, quantile),
