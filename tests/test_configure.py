@@ -109,24 +109,17 @@ def test_options_of_the_user_take_precedence(user):
     assert setup._merge_flags(setup._merge_flags(user, setup._compiler_options("gpu")), ALL) == flags
 
 
-@pytest.mark.parametrize("mode", [0o700, 0o770, 0o702])
-def test_a_cache_that_other_users_can_write_is_not_used(tmp_path, mode):
+@pytest.mark.parametrize(
+    "case", ["written by a group", "written by all", "of somebody else", "a link", "a file", "closed"]
+)
+def test_a_cache_that_other_users_can_write_is_not_used(tmp_path, monkeypatch, case):
     """Loading an entry runs machine code, so other users must not write it."""
     folder = tmp_path / "cache"
-    folder.mkdir()
-    folder.chmod(mode)
-    if mode == 0o700:
-        assert setup._check_cache_folder(folder) == folder
-    else:
-        with pytest.warns(RuntimeWarning, match="is not used: it must be a folder that belongs to you"):
-            assert setup._check_cache_folder(folder) is None
-
-
-@pytest.mark.parametrize("case", ["of somebody else", "a link", "a file", "closed"])
-def test_a_cache_folder_of_another_user_is_not_used(tmp_path, monkeypatch, case):
-    folder = tmp_path / "cache"
     (tmp_path / "elsewhere").mkdir(mode=0o700)
-    if case == "of somebody else":
+    if case.startswith("written"):
+        folder.mkdir()
+        folder.chmod(0o770 if "group" in case else 0o702)
+    elif case == "of somebody else":
         monkeypatch.setattr(setup.os, "geteuid", lambda: -1)
     elif case == "a link":
         folder.symlink_to(tmp_path / "elsewhere")
@@ -138,12 +131,13 @@ def test_a_cache_folder_of_another_user_is_not_used(tmp_path, monkeypatch, case)
             raise PermissionError(13, "Permission denied", str(self))
 
         monkeypatch.setattr(setup.Path, "mkdir", refused)
-    with pytest.warns(RuntimeWarning, match="is not used"):
+    with pytest.warns(RuntimeWarning, match="is not used: it must be a folder that belongs to you"):
         assert setup._check_cache_folder(folder) is None
 
 
-def test_a_new_cache_is_closed_to_others(tmp_path):
-    assert setup._check_cache_folder(tmp_path / "a" / "cache") == tmp_path / "a" / "cache"
+def test_a_new_cache_is_closed_to_others_and_used_again(tmp_path):
+    for _ in range(2):
+        assert setup._check_cache_folder(tmp_path / "a" / "cache") == tmp_path / "a" / "cache"
     assert (tmp_path / "a" / "cache").stat().st_mode & 0o777 == 0o700
 
 
