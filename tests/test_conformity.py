@@ -38,6 +38,17 @@ SHORT = {"t_end": 7.5, "window": 1.0}
 SAMPLED = {"mode": "sampled", "period": 0.25, **SHORT}
 SPREAD = {"attitude": {"kind": "axis_angle", "min_deg": 5.0, "max_deg": 60.0}}
 NOISE = {"attitude_noise": 2e-4, "rate_noise": 1e-5}
+EVERY_DEVICE = {
+    "attitude_noise": 2e-4, "rate_noise_density": 1e-6, "rate_bias": 1e-5, "rate_bias_walk": 1e-6,
+    "star_tracker_every": 3, "torque_limit": 2.0, "torque_rate_limit": 8.0, "torque_lag": 0.05,
+    "torque_step": 1e-3, "delay": 1, "command_filter": {"kind": "second_order", "corner": 6.0},
+}  # fmt: skip
+TURN_ON_WHEELS = {
+    "controller": {"kind": "time_base_sliding", "t_f": 6.0},
+    "reference": {"kind": "slew", "to_quat_xyzw": [0.28, 0.0, 0.0, 0.96], "duration": 5.0},
+    "loop": {**SAMPLED, "clock": "flight"},
+    "wheels": {"torque_limit": 1.5, "momentum_limit": 4.0},
+}
 SPIN = {"reference": {"kind": "spin", "rate": [0.01, -0.02, 0.03]}}
 
 QUICK = {  # gains that reach the target in such a short run; other laws have their defaults
@@ -52,7 +63,7 @@ ROWS: dict[str, dict] = {
     "continuous, spin, no observer": {
         "controller": {**SLEW, "sign_width": 0.05},
         "observer": {"kind": "none"},
-        "reference": {"kind": "spin", "rate": [0.01, -0.02, 0.03]},
+        **SPIN,
         "disturbance": {"kind": "constant", "amplitude": [0.01, -0.02, 0.0]},
         "loop": SHORT,
         "dispersion": {"attitude": {"kind": "normal", "std_deg": 5.0}},
@@ -70,11 +81,7 @@ ROWS: dict[str, dict] = {
         "controller": SLEW,
         "loop": SAMPLED,
         "filter": {"kind": "steady_state"},
-        "hardware": {
-            "attitude_noise": 2e-4, "rate_noise_density": 1e-6, "rate_bias": 1e-5, "rate_bias_walk": 1e-6,
-            "star_tracker_every": 3, "torque_limit": 2.0, "torque_rate_limit": 8.0, "torque_lag": 0.05,
-            "torque_step": 1e-3, "delay": 1, "command_filter": {"kind": "second_order", "corner": 6.0},
-        },
+        "hardware": EVERY_DEVICE,
         "disturbance": {
             "kind": "sum",
             "terms": [
@@ -85,25 +92,15 @@ ROWS: dict[str, dict] = {
         "dispersion": SPREAD,
     },
     "wheels, a law that remembers, flight clock, uniform attitudes": {
-        "controller": {"kind": "time_base_sliding", "t_f": 6.0},
-        "reference": {"kind": "slew", "to_quat_xyzw": [0.28, 0.0, 0.0, 0.96], "duration": 5.0},
-        "loop": {**SAMPLED, "clock": "flight"},
+        **TURN_ON_WHEELS,
         "hardware": {**NOISE, "torque_lag": 0.05},
-        "wheels": {"torque_limit": 1.5, "momentum_limit": 4.0},
         "dispersion": {"attitude": {"kind": "uniform"}},
     },
     "wheels, filter, every device, a law that remembers, prescribed-time observer, random walk": {
-        "controller": {"kind": "time_base_sliding", "t_f": 6.0},
+        **TURN_ON_WHEELS,
         "observer": {"kind": "prescribed_time", "t_o": 3.0, "delta_o": 0.5},
-        "reference": {"kind": "slew", "to_quat_xyzw": [0.28, 0.0, 0.0, 0.96], "duration": 5.0},
-        "loop": {**SAMPLED, "clock": "flight"},
         "filter": {"kind": "steady_state"},
-        "hardware": {
-            "attitude_noise": 2e-4, "rate_noise_density": 1e-6, "rate_bias": 1e-5, "rate_bias_walk": 1e-6,
-            "star_tracker_every": 3, "torque_limit": 2.0, "torque_rate_limit": 8.0, "torque_lag": 0.05,
-            "torque_step": 1e-3, "delay": 1, "command_filter": {"kind": "second_order", "corner": 6.0},
-        },
-        "wheels": {"torque_limit": 1.5, "momentum_limit": 4.0},
+        "hardware": EVERY_DEVICE,
         "disturbance": {
             "kind": "sum",
             "terms": [{"kind": "random_walk", "density": [1e-4, 1e-4, 2e-4]}, {"kind": "sinusoid"}],
