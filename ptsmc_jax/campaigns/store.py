@@ -158,7 +158,7 @@ def describe_difference(folder: Path, scenario: Tables, made_by: Tables) -> str 
     """Return in words how the run in the folder differs from this run; None if it does not."""
     versions = read_versions(folder)
     try:
-        old_tables = parsing.parse_toml((folder / "scenario.toml").read_text(encoding="utf-8"), "scenario.toml")
+        old_tables = parsing.read_toml(folder / "scenario.toml")
     except (OSError, ValueError):
         return "files, but no scenario.toml of a run that can be read"
     if not versions:

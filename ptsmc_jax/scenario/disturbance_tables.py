@@ -131,8 +131,7 @@ class GravityTable(Attitude, DisturbanceTable, frozen=True):
         return CIRCULAR_RATE if orbit_rate is None else orbit_rate
 
     def check(self, name: str, scenario: Any) -> None:
-        """Raise ScenarioError for two attitudes, an invalid attitude, and a second orbit beside [orbit]."""
-        attitude_keys.check_single_attitude(name, self)
+        """Raise ScenarioError for an invalid attitude, and a second orbit beside [orbit]."""
         if scenario.orbit is not None:
             numbers: Any = self
             replaced = {key: getattr(self, key) for key in (*attitude_keys.ATTITUDE_KEYS, "orbit_rate")}

@@ -18,18 +18,12 @@ class ScenarioError(ValueError):
     Attributes:
         key: the key whose value is not allowed, such as "controller.eta"; empty if no single key is wrong.
         value: the value of that key, as read.
-        reason: the text after the value.
-        allowed: the allowed values in words; empty if `reason` does not contain "but must be ..".
+        allowed: the allowed values in words; empty if the text does not contain "but must be ..".
     """
 
-    def __init__(self, text: str, *, key: str = "", value: Any = None, reason: str = "", allowed: str = ""):
+    def __init__(self, text: str, *, key: str = "", value: Any = None, allowed: str = ""):
         super().__init__(text)
-        self.key, self.value, self.reason, self.allowed = key, value, reason, allowed
-
-    def with_shown_value(self, value: str) -> "ScenarioError":
-        """Return the error with this text instead of the value."""
-        text = f"{self.key} is {value}{self.reason}"
-        return ScenarioError(text, key=self.key, value=self.value, reason=self.reason, allowed=self.allowed)
+        self.key, self.value, self.allowed = key, value, allowed
 
     def _render_traceback_(self) -> list[str]:
         """Return the sentence alone: IPython prints it in notebooks instead of a traceback."""
@@ -56,8 +50,7 @@ def value_error(key: str, value: Any, reason: str, allowed: str = "") -> Scenari
         reason: the text after the value, with the punctuation before it.
         allowed: the allowed values, in words; empty if the reason does not end with them.
     """
-    error = ScenarioError("", key=key, value=value, reason=reason, allowed=allowed)
-    return error.with_shown_value(brief(value))
+    return ScenarioError(f"{key} is {brief(value)}{reason}", key=key, value=value, allowed=allowed)
 
 
 def brief(value: Any) -> str:

@@ -1,6 +1,5 @@
 """The JSON Schema of scenario files, for completion and validation in editors. Start with `json_schema`."""
 
-import typing
 from collections.abc import Mapping
 from typing import Any
 
@@ -61,10 +60,10 @@ def _kinds_schema(name: str, kinds: type[Table] | Kinds, unit_of_d: str) -> Sche
 
 def _table_schema(struct: type[Table], unit_of_d: str, name: str = "") -> Schema:
     """Return the schema of a table of one kind; `name`: the table's name, for inline tables."""
-    hints, properties = typing.get_type_hints(struct, include_extras=True), {}
+    properties = {}
     for key in keys.list_keys(struct, unit_of_d):
-        inline = layouts.DISPERSIONS.get(key.name) if name == "dispersion" else layouts.KINDS.get(f"{name}.{key.name}")
-        schema = _value_schema(hints[key.name]) if inline is None else _kinds_schema("", inline, unit_of_d)
+        inline = layouts.KINDS.get(f"{name}.{key.name}")
+        schema = _value_schema(key.type) if inline is None else _kinds_schema("", inline, unit_of_d)
         if key.unit in catalogues.UNITS:
             schema = _allow_unit_text(schema, schema.pop("items", {}))
         if isinstance(key.default, bool | int | float | str):

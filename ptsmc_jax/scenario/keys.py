@@ -25,6 +25,7 @@ class Key(NamedTuple):
     unit: str  # empty if it has none
     allowed: str  # allowed values, in words
     default: Any  # None: off, or described in `meaning`; NODEFAULT: required
+    type: Any  # the type that `msgspec` checks
 
     @property
     def text(self) -> str:
@@ -58,27 +59,14 @@ def list_keys(struct: type[Table], unit_of_d: str = UNIT_OF_D) -> list[Key]:
             meaning, unit = next(one for one in hints[field.name].__metadata__ if isinstance(one, Meaning))
         unit = unit.replace(UNIT_OF_D, plant_unit)
         unit = unit.replace("unit of u", "N m") if plant_unit == "N m" else unit
-        keys.append(Key(field.name, meaning, unit, allowed_values(hints[field.name]), default))
+        type_ = hints[field.name]
+        keys.append(Key(field.name, meaning, unit, allowed_values(type_), default, type_))
     return keys
 
 
 def description(struct: type[Table]) -> str:
     """Return the description of a table or of one of its kinds: its docstring, which python -OO removes."""
     return " ".join((struct.__doc__ or "").split())
-
-
-def hint_other_kinds(name: str, key: str, struct: type[Table], kinds: Kinds) -> str:
-    """Return a hint that a key belongs to other kinds of a table, empty if no other kind has it.
-
-    Args:
-        name: name of the table.
-        key: name of the key.
-        struct: class of the table, one of `kinds`.
-        kinds: classes by kind.
-    """
-    other_kinds = [f'"{kind}"' for kind, other in kinds.items() if key in other.__struct_fields__]
-    this_kind = next((kind for kind, other in kinds.items() if other is struct), None)
-    return f' of {name}.kind = "{this_kind}", but of {", ".join(other_kinds)}' if other_kinds else ""
 
 
 def table_names_by_key(layout: Mapping[str, type[Table] | Kinds]) -> dict[str, list[str]]:
@@ -92,34 +80,12 @@ def table_names_by_key(layout: Mapping[str, type[Table] | Kinds]) -> dict[str, l
     return names
 
 
-def hint_other_tables(name: str, key: str, layout: Mapping[str, type[Table] | Kinds]) -> str:
-    """Return a hint that other tables have a key, such as "loop.period is".
-
-    Args:
-        name: name of the table that was searched.
-        key: name of the key.
-        layout: the tables of a scenario, by name.
-
-    Returns:
-        The hint, empty if the table has the key itself or if no table has it.
-    """
-    names = table_names_by_key(layout).get(key, [])
-    if name in names or not names:
-        return ""
-    return f"{', '.join(f'{other}.{key}' for other in names)} {'are' if names[1:] else 'is'}"
-
-
-def without_annotations(kind: Any) -> Any:
-    """Return a type without its annotations."""
-    return kind.__origin__ if hasattr(kind, "__metadata__") else kind
-
-
 def allowed_values(kind: Any) -> str:
     """Return the values that a type allows, in words."""
     meta = next((one for one in getattr(kind, "__metadata__", ()) if isinstance(one, msgspec.Meta)), None)
     if meta is not None and meta.description is not None:
         return meta.description
-    kind = without_annotations(kind)
+    kind = kind.__origin__ if hasattr(kind, "__metadata__") else kind
     if typing.get_origin(kind) in (types.UnionType, typing.Union):
         return " or ".join(dict.fromkeys(allowed_values(k) for k in typing.get_args(kind) if k is not type(None)))
     if isinstance(kind, type) and issubclass(kind, Table):

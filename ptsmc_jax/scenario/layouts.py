@@ -21,18 +21,7 @@ SCENARIOS: dict[str, type[Scenario]] = {
 TABLES: dict[str, Mapping[str, type[Table] | Kinds]] = {
     kind: scenario_class.TABLES for kind, scenario_class in SCENARIOS.items()
 }
-OPTIONAL = (
-    "orbit",
-    "flexible",
-    "hardware",
-    "sensors",
-    "wheels",
-    "filter",
-    "pointing",
-    "dispersion",
-    "requirements",
-    "tune",
-    "telemetry",
-    "identify",
-)  # tables that are off if they are absent
-KINDS: dict[str, Kinds] = {"hardware.command_filter": COMMAND_FILTERS}  # keys that are an inline table with a kind
+KINDS: dict[str, Kinds] = {  # keys that are an inline table with a kind
+    "hardware.command_filter": COMMAND_FILTERS,
+    **{f"dispersion.{key}": kinds for key, kinds in DISPERSIONS.items()},
+}

@@ -46,34 +46,30 @@ class Context(NamedTuple):
     run_code: bool = False  # whether code that the scenario names may run
 
 
-def parse_toml(text: str, name: str) -> dict[str, Any]:
-    """Return the raw tables of a TOML text; raise ScenarioError if it is not valid. `name` is used in errors."""
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """Return the raw tables of a TOML file; raise ScenarioError if it is missing or not valid."""
+    name = f"the scenario file {path}"
     try:
+        text = Path(path).read_text(encoding="utf-8-sig")  # some editors begin a file with a byte order mark
         if _LONG_DOTTED_KEY.search(text):
             raise RecursionError
         return tomllib.loads(text)
-    except ValueError as error:  # TOMLDecodeError, or a number with too many digits for Python
+    except FileNotFoundError:
+        raise ScenarioError(f"{name} does not exist") from None
+    except OSError as error:
+        raise ScenarioError(f"{name} cannot be read: {error.strerror}") from None
+    except ValueError as error:  # TOMLDecodeError, no UTF-8, or a number with too many digits for Python
         raise ScenarioError(f"{name} is no valid TOML: {error}") from None
     except RecursionError:
         raise ScenarioError(f"{name} has tables or arrays in each other, {_TOO_DEEP}") from None
 
 
 def load(path: str | Path) -> dict[str, Any]:
-    """Return the raw tables of a TOML file; raise ScenarioError if it is missing or not valid.
+    """Return the raw tables of a scenario file; raise ScenarioError if it is missing or not valid.
 
     Relative paths of Python files in it become absolute, relative to the folder of the TOML file. No code is run.
     """
-    try:
-        text = Path(path).read_text(encoding="utf-8-sig")  # some editors begin a file with a byte order mark
-    except FileNotFoundError:
-        raise ScenarioError(f"the scenario file {path} does not exist") from None
-    except IsADirectoryError:
-        raise ScenarioError(f"the scenario file {path} is a folder, but must be a TOML file") from None
-    except UnicodeDecodeError:
-        raise ScenarioError(f"the scenario file {path} is no text in UTF-8, but must be a TOML file") from None
-    except OSError as error:
-        raise ScenarioError(f"the scenario file {path} cannot be read: {error.strerror}") from None
-    raw = parse_toml(text, f"the scenario file {path}")
+    raw = read_toml(path)
     for table in custom.find_data_tables(raw):
         table["file"] = os.path.realpath(Path(path).parent / table["file"])
     for table, key in custom.find_code_keys(raw):
@@ -93,63 +89,60 @@ def parse(raw: Mapping[str, Any], *, run_code: bool = False) -> Scenario:
     Raises:
         ScenarioError: a table or key is unknown, or a value is not allowed.
     """
-    _check_shape(raw)
-    suite = raw.get("sensors")
-    if isinstance(suite, list | tuple):
-        raw = {name: table for name, table in raw.items() if name != "sensors"}
+    _check_shape("", raw, DEEPEST)
     known_names = {"requirements", *(key for layout in TABLES.values() for key in layout)}
     for name, table in raw.items():
-        if name in known_names and not isinstance(table, Mapping):
+        is_suite = name == "sensors" and isinstance(table, list | tuple)
+        if name in known_names and not isinstance(table, Mapping | None) and not is_suite:
             raise wrong(name, table, "a table")
-    kind = _plant_kind(raw.get("plant", {}))
+    present = {name: table for name, table in raw.items() if table is not None}
+    plant = present.get("plant", {})
+    kind = _kind_of("plant", plant, TABLES)
     scenario_class, layout = SCENARIOS[kind], TABLES[kind]
     for name, table in raw.items():
         if name not in layout and name != "requirements":
             raise _unknown_table_error(name, table, kind)
     context = Context(scenario_class, run_code)
-    plant = typing.cast(Any, _parse_table("plant", raw.get("plant", {}), layout["plant"], context))
-    law_kind = raw.get("controller", {}).get("kind", next(iter(typing.cast(Kinds, layout["controller"]))))
-    defaults = scenario_class.plant_defaults(plant, raw.get("plant", {}).keys(), law_kind)
-    tables: dict[str, Any] = {
-        name: _parse_table(name, _fill_absent_keys(raw.get(name, {}), defaults.get(name, {}), kinds), kinds, context)
-        for name, kinds in layout.items()
-        if name in raw or name not in layouts.OPTIONAL
-    }
-    for name in ("initial", "reference"):
-        if isinstance(tables.get(name), Attitude):
-            attitude_keys.check_single_attitude(name, tables[name])
-    if isinstance(suite, list | tuple):
-        tables["sensors"] = _parse_sensor_suite(suite, context)
+    law_kind = _kind_of("controller", present.get("controller", {}), typing.cast(Kinds, layout["controller"]))
+    plant_table = _parse_table("plant", plant, layout["plant"], context)
+    defaults = scenario_class.plant_defaults(plant_table, plant.keys(), law_kind)
+    tables: dict[str, Any] = {}
+    required = {field.name for field in msgspec.structs.fields(scenario_class) if field.required}
+    for name, kinds in layout.items():
+        table = present.get(name, {})
+        if isinstance(table, list | tuple):
+            tables[name] = _parse_sensor_suite(table, context)
+        elif name in present or name in required:
+            tables[name] = _parse_table(name, table, kinds, context, defaults.get(name))
     # plain limits first, as TOML writes them, so that the order of verdicts is the same for a scenario that was saved
-    requirements = sorted(raw.get("requirements", {}).items(), key=lambda one: isinstance(one[1], Mapping))
-    tables["requirements"] = {key: _parse_requirement(key, value, context) for key, value in requirements}
+    limits = {key: value for key, value in present.get("requirements", {}).items() if value is not None}
+    plain_first = sorted(limits, key=lambda key: isinstance(limits[key], Mapping))
+    tables["requirements"] = {key: _parse_requirement(key, limits[key], context) for key in plain_first}
     return scenario_class(**tables)
 
 
-def _check_shape(raw: Mapping[str, Any]) -> None:
+def _check_shape(name: str, value: Any, levels: int) -> None:
     """Raise ScenarioError for too deep nesting and for keys that cannot be printed, before other code visits them."""
-    level: list[tuple[str, Any]] = [("", raw)]
-    for _ in range(DEEPEST):
-        next_level: list[tuple[str, Any]] = []
-        for table, value in level:
-            if isinstance(value, Mapping):
-                for key, inner in value.items():
-                    if not (isinstance(key, str) and key.isprintable() and 0 < len(key) <= LONGEST_KEY):
-                        key_text = brief(key) if isinstance(key, str) else repr(key)
-                        holder = table or "the scenario"
-                        raise ScenarioError(f"{holder} has the key {key_text}, which is not a known one")
-                    next_level.append((table or key, inner))
-            elif isinstance(value, list | tuple):
-                next_level += [(table, inner) for inner in value]
-        level = [(table, value) for table, value in next_level if isinstance(value, Mapping | list | tuple)]
-    if level:
-        raise ScenarioError(f"{level[0][0]} has tables or arrays in each other, {_TOO_DEEP}")
+    if isinstance(value, Mapping):
+        for key in value:
+            if not (isinstance(key, str) and key.isprintable() and 0 < len(key) <= LONGEST_KEY):
+                key_text = brief(key) if isinstance(key, str) else repr(key)
+                raise ScenarioError(f"{name or 'the scenario'} has the key {key_text}, which is not a known one")
+        children = [(name or key, inner) for key, inner in value.items()]
+    else:
+        children = [(name, inner) for inner in value] if isinstance(value, list | tuple) else []
+    if children and not levels:
+        raise ScenarioError(f"{name} has tables or arrays in each other, {_TOO_DEEP}")
+    for table, inner in children:
+        _check_shape(table, inner, levels - 1)
 
 
-def _plant_kind(plant: Mapping[str, Any]) -> str:
-    kind = plant.get("kind", "spacecraft")
-    if not isinstance(kind, str) or kind not in TABLES:
-        raise wrong("plant.kind", kind, " or ".join(map(show, TABLES)))
+def _kind_of(name: str, raw: Mapping[str, Any], kinds: Mapping[str, Any]) -> str:
+    """Return the kind of a table, by default the first one; raise ScenarioError if there is no such kind."""
+    kind = next(iter(kinds)) if raw.get("kind") is None else raw["kind"]
+    if not isinstance(kind, str) or kind not in kinds:
+        known = list(map(show, kinds))
+        raise wrong(f"{name}.kind", kind, " or ".join(known) if len(known) < 8 else f"one of {', '.join(known)}")
     return kind
 
 
@@ -167,21 +160,6 @@ def _unknown_table_error(name: str, value: Any, kind: str) -> ScenarioError:
     closest = difflib.get_close_matches(name, tables_of_key, n=1, cutoff=0.0)[0]
     place = f"{tables_of_key[closest][-1]}.{closest}"
     return ScenarioError(f"{name} = {brief(value)} is outside of any table; the nearest known key is {place}")
-
-
-def _fill_absent_keys(
-    raw: Mapping[str, Any], defaults: Mapping[str, Any], struct_or_kinds: type[Table] | Kinds
-) -> Mapping[str, Any]:
-    """Return a table with absent keys filled in. An attitude that is given replaces the default attitude."""
-    if isinstance(struct_or_kinds, Mapping):
-        kind = raw.get("kind", next(iter(struct_or_kinds)))
-        struct = struct_or_kinds.get(kind) if isinstance(kind, str) else None  # `_parse_table` refuses other types
-    else:
-        struct = struct_or_kinds
-    has_attitude = struct is not None and issubclass(struct, Attitude)
-    if any(key in raw for key in ATTITUDE_KEYS) or not has_attitude:
-        defaults = {key: value for key, value in defaults.items() if key not in ATTITUDE_KEYS}
-    return {**defaults, **raw}
 
 
 def dump(scenario: Scenario) -> dict[str, Any]:
@@ -218,7 +196,7 @@ def unstated_values(raw: Mapping[str, Any], tables: Mapping[str, Any]) -> dict[t
             raw_inner = raw.get(key, {})
             inner_values = unstated_values(raw_inner if isinstance(raw_inner, Mapping) else {}, value)
             missing |= {(key, *path): one for path, one in inner_values.items()}
-        elif key not in raw:
+        elif raw.get(key) is None:
             missing[(key,)] = value
     return missing
 
@@ -272,21 +250,53 @@ def similar_names_hint(name: str, known: Iterable[str], where_listed: str) -> st
     return f"the nearest of {len(known)} known ones are {', '.join(matches)}; {where_listed}"
 
 
-def _parse_table(name: str, raw: Mapping[str, Any], kinds: type[Table] | Kinds, context: Context) -> Table:
-    if name == "dispersion":
-        return _parse_dispersion(raw, typing.cast(type[Table], kinds), context)
-    if not isinstance(kinds, Mapping):
-        return _parse_fields(name, raw, kinds, context)
-    kind = raw.get("kind", next(iter(kinds)))
-    if not isinstance(kind, str) or kind not in kinds:
-        known = list(map(show, kinds))
-        raise wrong(f"{name}.kind", kind, " or ".join(known) if len(known) < 8 else f"one of {', '.join(known)}")
-    struct = kinds[kind]
-    if struct is disturbance_tables.SumDisturbance:
-        return _parse_sum(name, raw, kinds, context)
+def _parse_table(
+    name: str,
+    raw: Any,
+    kinds: type[Table] | Kinds,
+    context: Context,
+    defaults: Mapping[str, Any] | None = None,
+) -> Table:
+    """Return a table.
+
+    Args:
+        name: name of the table, such as disturbance.terms[0].
+        raw: the table as read; a list of tables has been refused.
+        kinds: class of the table, or classes by kind.
+        context: properties of the scenario.
+        defaults: defaults that depend on the plant. An attitude that is given replaces the default attitude.
+    """
+    if isinstance(kinds, Mapping):
+        struct = kinds[_kind_of(name, raw, kinds)]
+    else:
+        struct, kinds = kinds, {}
+    defaults = defaults or {}
+    if any(key in raw for key in ATTITUDE_KEYS) or not issubclass(struct, Attitude):
+        defaults = {key: value for key, value in defaults.items() if key not in ATTITUDE_KEYS}
+    raw = {**defaults, **raw}
     if issubclass(struct, custom.Custom):
         return _parse_custom_part(name, raw, struct, context)
-    return _parse_fields(name, raw, struct, context, kinds)
+    if struct is not disturbance_tables.SumDisturbance:
+        return _parse_fields(name, raw, struct, context, kinds)
+    _parse_fields(name, {key: value for key, value in raw.items() if key != "terms"}, struct, context, kinds)
+    single_kinds = disturbance_tables.without_sums(kinds)
+    terms = _parse_list(f"{name}.terms", raw.get("terms", ()), single_kinds, disturbance_tables.TERMS_TEXT, context)
+    return disturbance_tables.SumDisturbance(terms=terms)
+
+
+def _parse_list(name: str, raw: Any, kinds: Kinds, allowed: str, context: Context) -> tuple[Any, ...]:
+    """Return a list of tables with a kind; `allowed`: description of it."""
+    if not isinstance(raw, list | tuple) or not raw or not all(isinstance(one, Mapping) for one in raw):
+        raise wrong(name, raw, allowed)
+    return tuple(_parse_table(f"{name}[{k}]", one, kinds, context) for k, one in enumerate(raw))
+
+
+def _parse_sensor_suite(raw: Any, context: Context) -> Table:
+    """Return the table of [[sensors]]."""
+    if context.scenario_class.motion != "spacecraft":
+        raise ScenarioError('[[sensors]] needs plant.kind = "spacecraft"; allowed is [sensors] with kind = "custom"')
+    allowed = "tables with a kind, [[sensors]] for each sensor"
+    return sensor_tables.SensorSuite(each=_parse_list("sensors", raw, sensor_tables.SENSORS, allowed, context))
 
 
 def _parse_custom_part(name: str, raw: Mapping[str, Any], struct: Any, context: Context) -> Table:
@@ -311,220 +321,95 @@ def _parse_custom_part(name: str, raw: Mapping[str, Any], struct: Any, context: 
     return msgspec.structs.replace(_parse_fields(name, shared_keys, struct, context), rest=rest)
 
 
-def _parse_sum(name: str, raw: Mapping[str, Any], kinds: Kinds, context: Context) -> Table:
-    """Return the table of a sum of disturbances, whose `terms` are tables of the other kinds."""
-    others = {key: value for key, value in raw.items() if key != "terms"}
-    _parse_fields(name, others, disturbance_tables.SumDisturbance, context)
-    terms = raw.get("terms", ())
-    if not isinstance(terms, list | tuple) or not terms or not all(isinstance(term, Mapping) for term in terms):
-        raise wrong(f"{name}.terms", terms, disturbance_tables.TERMS_TEXT)
-    single_kinds = disturbance_tables.without_sums(kinds)
-    parsed_terms = tuple(
-        _parse_table(f"{name}.terms[{k}]", term, single_kinds, context) for k, term in enumerate(terms)
-    )
-    return disturbance_tables.SumDisturbance(terms=parsed_terms)
-
-
-def _parse_sensor_suite(raw_sensors: Any, context: Context) -> Table:
-    """Return the table of [[sensors]]."""
-    if context.scenario_class.motion != "spacecraft":
-        raise ScenarioError('[[sensors]] needs plant.kind = "spacecraft"; allowed is [sensors] with kind = "custom"')
-    if not raw_sensors or not all(isinstance(one, Mapping) for one in raw_sensors):
-        raise wrong("sensors", raw_sensors, "tables with a kind, [[sensors]] for each sensor")
-    return sensor_tables.SensorSuite(
-        each=tuple(
-            _parse_table(f"sensors[{k}]", one, sensor_tables.SENSORS, context) for k, one in enumerate(raw_sensors)
-        )
-    )
-
-
-def _parse_dispersion(raw: Mapping[str, Any], struct: type[Table], context: Context) -> Table:
-    """Return the table [dispersion], whose keys are inline tables with a kind."""
-    tables = {}
-    for key, table in raw.items():
-        _check_key("dispersion", key, struct, context)
-        if not isinstance(table, Mapping):
-            raise wrong(f"dispersion.{key}", table, 'an inline table such as { kind = "uniform" }')
-        tables[key] = _parse_table(f"dispersion.{key}", table, layouts.DISPERSIONS[key], context)
-    return struct(**tables)
-
-
 def _parse_requirement(metric: str, value: Any, context: Context) -> float | Limit:
     key, metrics = f"requirements.{metric}", context.scenario_class.metrics
     if metric not in metrics and metric not in catalogues.MARGINS:
         raise ScenarioError(
             f"{key} is not a known metric; {nearest_name_hint(metric, (*metrics, *catalogues.MARGINS))}"
         )
-    if isinstance(value, Mapping):
-        if metric in catalogues.MARGINS:
-            raise wrong(key, value, "a number greater than 0, which every loop must keep")
-        if "limit" not in value:
-            raise wrong(key, value, "a number greater than 0 or a table with `limit`")
-        value = {**value, "limit": _parse_limit(f"{key}.limit", value["limit"], metric, metrics)}
-        return typing.cast(Limit, _parse_fields(key, value, Limit, context))
-    return _parse_limit(key, value, metric, metrics)
-
-
-def _parse_limit(key: str, value: Any, metric: str, metrics: Mapping[str, Any]) -> float:
-    """Return a limit in the metric's unit; the value is a number or a text such as "0.05 deg"."""
     allowed = NotNegative if metric in catalogues.MAY_BE_ZERO else Positive
-    if isinstance(value, str):
-        value = _convert_text(key, value, {**metrics, **catalogues.MARGINS}[metric].unit, keys.allowed_values(allowed))
-    return _parse_value(key, value, allowed)
-
-
-def _convert_text(key: str, text: str, unit: str, allowed: str) -> float:
-    """Convert a text such as "0.05 deg" to a number in a unit; raise ScenarioError if it is not possible."""
-    units = catalogues.UNITS.get(unit, {})
-    size, name = _split_unit(text)
-    if name not in units or not math.isfinite(size):
-        example = f', or with a unit such as "0.05 {[*units][:2][-1]}", in {", ".join(units)}' if units else ""
-        raise wrong(key, text, allowed + (f" [{unit}]" if unit != "-" else "") + example)
-    return size * units[name]
-
-
-def _split_unit(text: str) -> tuple[float, str]:
-    """Return the number of a text such as "0.05 deg", NaN if there is none, and the name of its unit."""
-    match = re.fullmatch(r"([-+]?[\d.]+(?:[eE][-+]?\d+)?) ?(.*)", " ".join(text.split()))
-    number, name = match.groups() if match else ("", "")
-    try:
-        return float(number), name
-    except ValueError:
-        return math.nan, name
-
-
-def quote_as_written(error: ScenarioError, raw: Mapping[str, Any]) -> ScenarioError:
-    """Return an error that quotes its value as the raw tables write it, such as "8 arcsec", and in SI units."""
-    written = _raw_value(raw, error.key)
-    is_list = isinstance(written, list | tuple)
-    if not any(map(_si_unit, written if is_list else [written])):
-        return error
-    number = list(map(_convert_to_si, written)) if is_list else _convert_to_si(written)
-    if number != (list(error.value) if isinstance(error.value, tuple) else error.value):
-        return error
-    unit = _si_unit(written)
-    si_text = f" ({number:.6g} {unit})" if unit and number != _split_unit(written)[0] else ""
-    return error.with_shown_value(f"{brief(written)}{si_text}")
-
-
-def _raw_value(raw: Any, key: str) -> Any:
-    """Return the value of a key such as disturbance.terms[0].amplitude in raw tables; None if they do not have it."""
-    for part in re.findall(r"[^][.]+", key):
-        if isinstance(raw, list | tuple):
-            raw = raw[int(part)] if part.isdecimal() and int(part) < len(raw) else None
-        else:
-            raw = raw.get(part) if isinstance(raw, Mapping) else None
-    return raw
-
-
-def _convert_to_si(value: Any) -> Any:
-    """Return a text such as "8 arcsec" as a number in SI units, and any other value unchanged."""
-    unit = _si_unit(value)
-    if not unit:
-        return value
-    size, name = _split_unit(value)
-    return size * catalogues.UNITS[unit][name]
-
-
-def _si_unit(value: Any) -> str:
-    """Return the SI unit of a text such as "8 arcsec", here rad; empty if the value is not such a text."""
-    name = _split_unit(value)[1] if isinstance(value, str) else ""
-    return next((unit for unit, names in catalogues.UNITS.items() if name in names), "")
-
-
-def _convert_value(name: str, value: Any, struct: type[Table], value_type: Any, context: Context) -> Any:
-    """Convert the value of a key from text with a unit, such as "1 mN m", to a number or a list of numbers.
-
-    Other values are returned unchanged.
-    """
-    is_list = isinstance(value, list | tuple)
-    has_text = isinstance(value, str) or (is_list and any(isinstance(one, str) for one in value))
-    if not has_text or name in layouts.KINDS or _is_valid(value, value_type):
-        return value
-    key = name.rpartition(".")[2]
-    unit = next((one.unit for one in keys.list_keys(struct, context.scenario_class.unit_of_d) if one.name == key), "")
-    if unit not in catalogues.UNITS:
-        return value
-
-    def convert(one: Any) -> Any:
-        return _convert_text(name, one, unit, keys.allowed_values(value_type)) if isinstance(one, str) else one
-
-    return [convert(one) for one in value] if is_list else convert(value)
-
-
-def _is_valid(value: Any, value_type: Any) -> bool:
-    try:
-        msgspec.convert(value, value_type, strict=True)
-    except msgspec.ValidationError:
-        return False
-    return True
+    unit = {**metrics, **catalogues.MARGINS}[metric].unit
+    if not isinstance(value, Mapping):
+        return _parse_value(key, value, allowed, unit)
+    if metric in catalogues.MARGINS:
+        raise wrong(key, value, "a number greater than 0, which every loop must keep")
+    if "limit" not in value:
+        raise wrong(key, value, "a number greater than 0 or a table with `limit`")
+    limit = _parse_value(f"{key}.limit", value["limit"], allowed, unit)
+    return typing.cast(Limit, _parse_fields(key, {**value, "limit": limit}, Limit, context))
 
 
 def _parse_fields(
     name: str, raw: Mapping[str, Any], struct: type[Table], context: Context, kinds: Kinds | None = None
 ) -> Table:
-    hints = typing.get_type_hints(struct, include_extras=True)
-    for key in raw:
-        _check_key(name, key, struct, context, kinds)
-    values = {key: _convert_value(f"{name}.{key}", value, struct, hints[key], context) for key, value in raw.items()}
-    return struct(**{key: _parse_key(f"{name}.{key}", value, hints[key], context) for key, value in values.items()})
+    known_keys = {key.name: key for key in keys.list_keys(struct, context.scenario_class.unit_of_d)}
+    values = {}
+    for key, value in raw.items():
+        if key not in struct.__struct_fields__:
+            raise _unknown_key_error(name, key, struct, context, kinds or {})
+        if value is None or key == "kind":  # `_kind_of` has read the kind
+            continue
+        inline_kinds = layouts.KINDS.get(f"{name}.{key}")
+        if inline_kinds is None:
+            values[key] = _parse_value(f"{name}.{key}", value, known_keys[key].type, known_keys[key].unit)
+        elif isinstance(value, Mapping):
+            values[key] = _parse_table(f"{name}.{key}", value, inline_kinds, context)
+        else:
+            example = show(next(iter(inline_kinds)))
+            raise wrong(f"{name}.{key}", value, f"an inline table such as {{ kind = {example} }}")
+    table = struct(**values)
+    if isinstance(table, Attitude):
+        attitude_keys.check_single_attitude(name, table)
+    return table
 
 
-def _check_key(name: str, key: str, struct: type[Table], context: Context, kinds: Kinds | None = None) -> None:
-    """Raise ScenarioError if the table of this name, of one of these kinds, has no such key."""
-    if key not in (known_keys := struct.__struct_fields__):
-        other_kinds = keys.hint_other_kinds(name, key, struct, kinds or {})
-        hint = keys.hint_other_tables(name, key, context.scenario_class.TABLES)
-        hint = hint or nearest_name_hint(key, known_keys, f"{name}.{{}}")
-        raise ScenarioError(f"{name}.{key} is not a known key{other_kinds}; {hint}")
+def _unknown_key_error(name: str, key: str, struct: type[Table], context: Context, kinds: Kinds) -> ScenarioError:
+    """Return the error for a key that the table of this name does not have; `kinds`: kinds of the table."""
+    others = [show(kind) for kind, other in kinds.items() if key in other.__struct_fields__]
+    this_kind = next((kind for kind, other in kinds.items() if other is struct), None)
+    other_kinds = f" of {name}.kind = {show(this_kind)}, but of {', '.join(others)}" if others else ""
+    tables = keys.table_names_by_key(context.scenario_class.TABLES).get(key, [])
+    if tables and name not in tables:
+        hint = f"{', '.join(f'{table}.{key}' for table in tables)} {'are' if tables[1:] else 'is'}"
+    else:
+        hint = nearest_name_hint(key, struct.__struct_fields__, f"{name}.{{}}")
+    return ScenarioError(f"{name}.{key} is not a known key{other_kinds}; {hint}")
 
 
-def _parse_key(key: str, value: Any, value_type: Any, context: Context) -> Any:
-    """Return the value of a key, or its inline table with a kind."""
-    kinds = layouts.KINDS.get(key)
-    if kinds is None:
-        return _parse_value(key, value, value_type)
-    if isinstance(value, Table):
-        return value
-    if not isinstance(value, Mapping):
-        raise wrong(key, value, f"an inline table such as {{ kind = {show(next(iter(kinds)))} }}")
-    return _parse_table(key, value, kinds, context)
-
-
-def _parse_value(key: str, value: Any, value_type: Any) -> Any:
+def _parse_value(key: str, value: Any, value_type: Any, unit: str = "") -> Any:
+    """Return the value of a key. Texts with a unit, such as "0.05 deg", become numbers in the unit of the key."""
     try:
-        value = _to_tuples(value)
+        number = _to_numbers(value, catalogues.UNITS.get(unit, {}))
     except TypeError:  # raised by JAX for a traced value
         raise ScenarioError(f"{key} is traced by JAX, but must be known here; with_gains takes traced gains") from None
-    bad = _find_non_finite(value)
+    allowed = keys.allowed_values(value_type)
+    bad = _find_non_finite(number)
     if bad is not None:
-        raise wrong(key, value, f"{keys.allowed_values(value_type)}, and {show(bad)} is no finite number")
-    # numpy, which reads the inertia, converts true to 1
-    if _has_bool(value) and keys.without_annotations(value_type) is not bool:
-        raise wrong(key, value, keys.allowed_values(value_type))
+        raise wrong(key, value, f"{allowed}, and {show(bad)} is no finite number")
     try:
-        return msgspec.convert(value, value_type, strict=True)
+        return msgspec.convert(number, value_type, strict=True)
     except msgspec.ValidationError:
-        raise wrong(key, value, keys.allowed_values(value_type) + _per_axis_hint(key, value)) from None
+        raise wrong(key, value, allowed + _hint(key, number, unit)) from None
 
 
-def _per_axis_hint(key: str, value: Any) -> str:
-    """Return a hint if the value is one noise per axis. [hardware] allows one number for all axes."""
-    table, _, name = key.partition(".")
-    if table != "hardware" or name not in device_tables.Hardware.noise_keys or not isinstance(value, tuple):
-        return ""
-    return " for all axes: the largest one, or a custom sensor in [sensors] if they differ"
+def _hint(key: str, value: Any, unit: str) -> str:
+    """Return a hint if a value that is not allowed has texts without a known unit, or is one noise per axis."""
+    units = [*catalogues.UNITS.get(unit, {})]
+    if units and any(isinstance(one, str) for one in (value if isinstance(value, tuple) else [value])):
+        return f' [{unit}], or with a unit such as "0.05 {units[:2][-1]}", in {", ".join(units)}'
+    if key.removeprefix("hardware.") in device_tables.Hardware.noise_keys and isinstance(value, tuple):
+        return " for all axes: the largest one, or a custom sensor in [sensors] if they differ"
+    return ""
 
 
-def _to_tuples(value: Any) -> Any:
-    """Convert lists and NumPy arrays to tuples of Python numbers."""
+def _to_numbers(value: Any, units: Mapping[str, float]) -> Any:
+    """Convert lists and NumPy arrays to tuples of Python numbers, and texts with one of these units to numbers."""
     if hasattr(value, "tolist"):
         value = value.tolist()
-    return tuple(map(_to_tuples, value)) if isinstance(value, list | tuple) else value
-
-
-def _has_bool(value: Any) -> bool:
-    return isinstance(value, bool) or (isinstance(value, tuple) and any(map(_has_bool, value)))
+    if isinstance(value, str):
+        match = re.fullmatch(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?) ?(.*)", " ".join(value.split()))
+        return float(match[1]) * units[match[2]] if match and match[2] in units else value
+    return tuple(_to_numbers(one, units) for one in value) if isinstance(value, list | tuple) else value
 
 
 def _find_non_finite(value: Any) -> float | int | None:

@@ -8,7 +8,7 @@ import msgspec
 
 from ptsmc_jax.declare import Scaled
 from ptsmc_jax.scenario import checks, custom, free_gains, layouts, mission, parsing
-from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.scenario.errors import wrong
 from ptsmc_jax.scenario.tables import Scenario, check_scenario
 from ptsmc_jax.scenario.values import Table
 
@@ -31,7 +31,7 @@ def from_tables(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
     """Return the validated scenario of raw tables, such as a parsed TOML file.
 
     Args:
-        raw: tables by name; keys that are absent get their defaults.
+        raw: tables by name; tables and keys that are absent or None get their defaults.
         run: whether custom code may run. If not, the keys and gains of custom parts are not validated, see `complete`.
 
     Raises:
@@ -41,14 +41,6 @@ def from_tables(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
     if not isinstance(raw, Mapping):
         actual = f"this is a {type(raw).__name__}"
         raise TypeError(f'tables are needed, such as {{"controller": {{"t_f": 35.0}}}}, but {actual}')
-    try:
-        return _validate(raw, run)
-    except ScenarioError as error:
-        raise parsing.quote_as_written(error, raw) from None
-
-
-def _validate(raw: Mapping[str, Any], run: bool) -> Scenario:
-    """Return the scenario of raw tables, with the defaults that depend on other keys."""
     scenario = resolve(parsing.parse(raw, run_code=run))
     checks.check_keys(scenario)
     if scenario.tune is not None and not custom.has_unloaded_code(scenario):
@@ -123,44 +115,24 @@ def replace(scenario: Scenario | str | Path, **changes: Any) -> Scenario:
     """
     scenario = to_scenario(scenario)
     tables = parsing.stated_tables(scenario)
-    for name in sorted(changes, key=_change_order):
+    # whole tables first, then kinds, then other keys, which these would discard
+    for name in sorted(changes, key=lambda name: ("__" in name, not name.endswith("__kind"))):
         value, (table, _, key) = changes[name], name.partition("__")
-        present = tables.get(table, {})
-        if key and not isinstance(present, Mapping):
-            continue  # `from_tables` reports a table that is not a mapping
-        if value is None and _is_known(scenario, table, key):
-            if not key:
-                tables.pop(table, None)
-            elif key == "kind" and _is_another_kind(scenario, table):
-                tables[table] = {}
-            elif key in present:  # in a copy: the table may belong to the caller
-                tables[table] = {other: kept for other, kept in present.items() if other != key}
-        elif not key:
-            tables[table] = parsing.to_dict(value) if isinstance(value, Table) else value
-        elif key == "kind" and getattr(getattr(scenario, table, None), "kind", None) != value:
+        value = parsing.to_dict(value) if isinstance(value, Table) else value
+        present = tables.get(table) or {}
+        if not key:
+            tables[table] = value
+        elif not isinstance(present, Mapping):
+            raise wrong(table, present, "a table")
+        elif key == "kind" and getattr(getattr(scenario, table, None), "kind", None) != (
+            _default_kind(scenario, table) if value is None else value
+        ):
             tables[table] = {"kind": value}
         else:
             tables[table] = {**present, key: value}
     return from_tables(tables, run=not custom.has_unloaded_code(scenario))
 
 
-def _change_order(name: str) -> int:
-    """Return the order of a change: whole tables, then kinds, then other keys, which these would discard."""
-    _, _, key = name.partition("__")
-    return 0 if not key else 1 if key == "kind" else 2
-
-
-def _is_another_kind(scenario: Scenario, table: str) -> bool:
-    """Whether the kind of a table differs from the default kind."""
+def _default_kind(scenario: Scenario, table: str) -> str | None:
     kinds = layouts.SCENARIOS if table == "plant" else scenario.TABLES.get(table)
-    kind = getattr(getattr(scenario, table), "kind", None)
-    return isinstance(kinds, Mapping) and kind not in (None, next(iter(kinds)))
-
-
-def _is_known(scenario: Scenario, table: str, key: str) -> bool:
-    """Whether a table or key exists; `from_tables` reports an unknown one."""
-    tables = set(scenario.__struct_fields__) - {"defaulted"}
-    present = getattr(scenario, table) if table in tables else None
-    if not key or present is None:
-        return table in tables
-    return key in present.__struct_fields__ if isinstance(present, msgspec.Struct) else True
+    return next(iter(kinds)) if isinstance(kinds, Mapping) else None

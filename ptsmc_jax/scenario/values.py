@@ -21,7 +21,10 @@ NotNegatives = Annotated[
 Four = Annotated[tuple[float, float, float, float], Meta(description="four numbers")]
 Matrix = Annotated[tuple[Three, Three, Three], Meta(description="three rows of three numbers")]
 Interval = Annotated[tuple[float, float], Meta(description="two numbers, the lower bound first")]
-Inertia = Annotated[Any, Meta(description="three principal moments or a symmetric 3x3 tensor [kg m^2]")]
+Inertia = Annotated[
+    tuple[int | float | tuple[int | float, ...], ...],
+    Meta(description="three principal moments or a symmetric 3x3 tensor [kg m^2]"),
+]
 Quantile = Annotated[float, Meta(gt=0, lt=1, description="a number between 0 and 1")]
 
 # Types of keys whose default depends on other keys. Their value is None until `reading.resolve` fills it in.

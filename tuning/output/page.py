@@ -101,7 +101,7 @@ def read(folder: Path) -> Result:
         else:
             summary = json.loads((folder / store.SUMMARY).read_text(encoding="utf-8"))
         path = folder / "scenario.toml"
-        scenario = parsing.parse_toml(path.read_text(encoding="utf-8"), str(path)) if path.exists() else {}
+        scenario = parsing.read_toml(path) if path.exists() else {}
     except FileNotFoundError:
         raise _unfinished_error(folder, versions) from None
     except (csv.Error, ValueError, RecursionError) as error:
