@@ -6,7 +6,6 @@ are not validated. Start with `custom_kind` and `load_table`.
 
 import dataclasses
 import functools
-import inspect
 import math
 import re
 import typing
@@ -58,14 +57,8 @@ def custom_kind(
         summary: description of the kind.
         has_gains: whether a custom class may have gains.
     """
-    return _custom_kind(table, base, required_methods, summary, has_gains)
-
-
-@functools.cache
-def _custom_kind(table: Any, base: type, required_methods: tuple[str, ...], summary: str, has_gains: bool) -> Any:
     namespace = {"__doc__": summary, "base": base, "required_methods": required_methods, "has_gains": has_gains}
     namespace["__module__"] = __name__
-    namespace["pickle_arguments"] = (_custom_kind, table, base, required_methods, summary, has_gains)
     rest_field = ("rest", dict[str, Any], msgspec.field(default_factory=dict))
     fields = [("kind", Literal["custom"], "custom"), ("code", Code), rest_field]
     return msgspec.defstruct("Custom", fields, bases=(Custom, table), frozen=True, kw_only=True, namespace=namespace)
@@ -164,61 +157,45 @@ def load_table(table: Any, name: str, code: object) -> Any:
         if not (isinstance(item, type) and issubclass(item, base)):
             shown_type = f"a class {item.__name__}" if isinstance(item, type) else f"of type {type(item).__name__}"
             raise ValueError(f"it is {shown_type}, but must be a class derived from ptsmc_jax.{base.__name__}")
-        return _add_class_keys(table, item, (_reload_table, table.pickle_arguments, name, code))
+        return _add_class_keys(table, item)
     except ValueError as error:
         shown = brief(code) if isinstance(code, str) else getattr(code, "__name__", type(code).__name__)
         raise ScenarioError(f"{name}.code is {shown}: {error}") from None
 
 
-def _reload_table(remake: tuple, name: str, code: object) -> Any:
-    make_table, *arguments = remake
-    return load_table(make_table(*arguments), name, code)
-
-
 @functools.lru_cache(maxsize=256)
-def _add_class_keys(table: Any, custom_class: Any, remake: tuple) -> Any:
+def _add_class_keys(table: Any, custom_class: Any) -> Any:
+    """Return the table with the keys of a class; raise ValueError if the class is not allowed."""
     base = table.base
     if all(getattr(custom_class, method, None) is getattr(base, method, None) for method in table.required_methods):
         raise ValueError(f"the class {custom_class.__name__} has no method {' or '.join(table.required_methods)}")
-    base_fields = {field.name: field for field in dataclasses.fields(base)}
-    for name in _annotated_names(custom_class, base):
-        existing = getattr(base, name, None)
-        if name in base_fields.keys() - {REDECLARABLE_FIELD} or callable(existing) or isinstance(existing, property):
-            raise _name_in_use_error(custom_class, name, "another name")
-        if hasattr(base, name):
-            raise _name_in_use_error(custom_class, name, f"{name} = .. without a type")
     for cls in reversed(custom_class.__mro__):  # custom base classes have fields too
         if issubclass(cls, base) and "__dataclass_fields__" not in cls.__dict__:
             try:
                 dataclasses.dataclass(frozen=True)(cls)
             except TypeError as error:  # for example a field without a default
-                raise ValueError(f"the class {cls.__name__} cannot have such fields: {error}") from None
+                allowed = "fields with a default, whose names the base class does not use"
+                raise ValueError(
+                    f"the class {cls.__name__} cannot have such fields: {error}; allowed are {allowed}"
+                ) from None
+    base_fields = {field.name: field for field in dataclasses.fields(base)}
     declarations = {}
     for field in dataclasses.fields(custom_class):
-        if base_fields.get(field.name) is not None and base_fields[field.name].default is field.default:
+        name = field.name
+        if field is base_fields.get(name):
             continue
-        if (hasattr(table, field.name) or field.name == "rest") and field.name not in base_fields:  # the name is in use
-            raise _name_in_use_error(custom_class, field.name, "another name")
-        if table.prefix + field.name == "observer_gain" or re.fullmatch(
-            r"observer_gain_\d+", table.prefix + field.name
-        ):
+        in_use = name in base_fields or name == "rest" or hasattr(base, name) or hasattr(table, name)
+        if in_use and name != REDECLARABLE_FIELD:
             raise ValueError(
-                f"its field {field.name} needs another name: gain_1, gain_2 .. are the numbers of gain for each axis"
+                f"the class {custom_class.__name__} has a field {name}, a name that the base class already uses; "
+                f"allowed is another name, or {name} = .. without a type"
             )
-        declarations[field.name] = _declaration(table, custom_class, field)
-    return schema.extend_table(table, custom_class, "custom", declarations, pickle_arguments=remake)
-
-
-def _annotated_names(custom_class: type, base: type) -> Iterator[str]:
-    """Yield the annotated names of a custom class and its custom bases; annotations make them dataclass fields."""
-    for cls in custom_class.__mro__:
-        if issubclass(cls, base) and cls is not base:
-            yield from (name for name, hint in inspect.get_annotations(cls).items() if "ClassVar" not in str(hint))
-
-
-def _name_in_use_error(custom_class: type, name: str, allowed: str) -> ValueError:
-    beginning = f"the class {custom_class.__name__} has a field {name}, a name that the base class already uses"
-    return ValueError(f"{beginning}; allowed is {allowed}")
+        if re.fullmatch(r"observer_gain(_\d+)?", table.prefix + name):
+            raise ValueError(
+                f"its field {name} needs another name: gain_1, gain_2 .. are the numbers of gain for each axis"
+            )
+        declarations[name] = _declaration(table, custom_class, field)
+    return schema.extend_table(table, custom_class, "custom", declarations, table.body)
 
 
 def fastest_rate(table: Any, name: str, part: Any) -> float:
@@ -238,8 +215,7 @@ def fastest_rate(table: Any, name: str, part: Any) -> float:
     except (TypeError, ValueError):
         rate = math.nan
     if not rate >= 0.0:
-        description = "nothing" if returned is None else f"a {type(returned).__name__}"
-        shown = brief(returned) if isinstance(returned, int | float | str) else description
+        shown = "nothing" if returned is None else brief(returned)
         raise ScenarioError(
             f"{name}.code is the class {table.part_class.__name__}, whose method fastest returns {shown}, but must "
             "return an angular frequency of at least 0 rad/s"
@@ -269,31 +245,19 @@ def _declaration(table: Any, custom_class: Any, field: dataclasses.Field) -> Dec
         allowed = f"a number{declared.limits.words()}"
         raise ValueError(f"the default of {field.name} is {value:g}, but must be {allowed}") from None
     if declared.gain:
-        _check_gain(table, custom_class, field.name, declared)
+        if not table.has_gains:
+            raise ValueError(
+                f"its field {field.name} is a gain, but the tuner cannot change parts of this kind; allowed is a number"
+            )
+        if not table.prefix and is_reserved(field.name):
+            raise ValueError(f"its gain {field.name} needs another name: a gain of a built-in part has this name")
+        if declared.usual is None:
+            raise ValueError(
+                f"the gain {field.name} of the class {custom_class.__name__} has no bounds; allowed is "
+                "ptsmc_jax.gain(.., usual=(lower, upper))"
+            )
     return declared
 
 
 def _is_number(value: object) -> typing.TypeGuard[float]:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _check_gain(table: Any, custom_class: Any, name: str, gain: Declaration) -> None:
-    """Raise ValueError if this kind of table cannot have the gain, or if the gain has no valid usual bounds."""
-    if not table.has_gains:
-        raise ValueError(
-            f"its field {name} is a gain, but the tuner cannot change parts of this kind; allowed is a number"
-        )
-    if not table.prefix and is_reserved(name):
-        raise ValueError(f"its gain {name} needs another name: a gain of a built-in part has this name")
-    usual: Any = gain.usual
-    if usual is None:
-        raise ValueError(
-            f"the gain {name} of the class {custom_class.__name__} has no bounds; allowed is ptsmc_jax.gain(.., "
-            "usual=(lower, upper))"
-        )
-    valid = isinstance(usual, tuple | list) and len(usual) == 2 and all(map(_is_number, usual)) and usual[0] < usual[1]
-    if valid and not usual[0] <= gain.default <= usual[1]:
-        raise ValueError(
-            f"the default of the gain {name} is {gain.default:g}, but must be a number from {usual[0]:g} to "
-            f"{usual[1]:g}, its usual bounds"
-        )

@@ -3,6 +3,7 @@
 This module validates single tables and keys. `checks` validates constraints between keys.
 """
 
+import copyreg
 import difflib
 import math
 import os
@@ -174,6 +175,19 @@ def to_raw_tables(scenario: Scenario) -> dict[str, Any]:
         raw["sensors"] = raw["sensors"]["each"]
     names = [name for name in TABLES[scenario.plant.kind] if name != "tune"]
     return {name: raw[name] for name in (*names, "requirements", "tune") if name in raw}
+
+
+def _reduce(scenario: Scenario) -> tuple:
+    """Pickle a scenario as its tables, since no module contains the classes that are made from declarations."""
+    return _restore, (to_raw_tables(scenario), not custom.has_unloaded_code(scenario), scenario.defaulted)
+
+
+def _restore(raw: Mapping[str, Any], run_code: bool, defaulted: dict[tuple[str, ...], Any]) -> Scenario:
+    return msgspec.structs.replace(parse(raw, run_code=run_code), defaulted=defaulted)
+
+
+for _scenario_class in SCENARIOS.values():
+    copyreg.pickle(_scenario_class, _reduce)
 
 
 def stated_tables(scenario: Scenario) -> dict[str, Any]:

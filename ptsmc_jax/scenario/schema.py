@@ -31,14 +31,6 @@ class PartTable(Table, frozen=True):
     # Further such gains, in a sampled loop only. In a continuous loop, tuning would make K1 as large and the boundary
     # layer as thin as allowed, because both cost only integration steps.
     free_if_sampled: ClassVar[tuple[str, ...]] = ()
-    pickle_arguments: ClassVar[tuple] = ()  # a function that makes this type, and its arguments
-
-    def __reduce__(self) -> tuple:
-        """Pickle with the arguments that make this type, since no module contains it."""
-        return _unpickle_table, (
-            self.pickle_arguments or type(self),
-            {name: getattr(self, name) for name in self.__struct_fields__},
-        )
 
     def part(self, **known_values: Any) -> Any:
         """Return the part. Fields that are not in `known_values` get the numbers of the keys with their names."""
@@ -58,12 +50,6 @@ class PartTable(Table, frozen=True):
     def keys_per_input(self) -> tuple[str, ...]:
         """Keys with one number for each input of the plant."""
         return tuple(name for name, one in self.declared.items() if one.each)
-
-
-def _unpickle_table(pickle_arguments: Any, values: dict[str, Any]) -> Any:
-    return (pickle_arguments[0](*pickle_arguments[1:]) if isinstance(pickle_arguments, tuple) else pickle_arguments)(
-        **values
-    )
 
 
 @functools.cache
@@ -87,36 +73,14 @@ def make_table(
         body: whether the plant is a spacecraft.
         changes: keys and defaults that replace the declared defaults for this plant.
     """
-    return _cached_table(base, part_class, kind, body, changes)
-
-
-@functools.cache
-def _cached_table(base: Any, part_class: Any, kind: str, body: bool, changes: tuple) -> Any:
     declared = declare.declared(part_class)
     declared |= {name: declared[name]._replace(default=default) for name, default in changes}
-    return extend_table(
-        base,
-        part_class,
-        kind,
-        declared,
-        body=body,
-        pickle_arguments=(_cached_table, base, part_class, kind, body, changes),
-    )
+    return extend_table(base, part_class, kind, declared, body)
 
 
-def extend_table(
-    base: Any, part_class: Any, kind: str, declared: Mapping[str, Declaration], **class_variables: Any
-) -> Any:
-    """Return a subclass of a table with declared keys.
-
-    Args:
-        base: the table.
-        part_class: the class of the part.
-        kind: name of the kind.
-        declared: declarations by key.
-        class_variables: further class variables.
-    """
-    body, fields = class_variables.get("body", base.body), []
+def extend_table(base: Any, part_class: Any, kind: str, declared: Mapping[str, Declaration], body: bool) -> Any:
+    """Return a subclass of a table with declared keys; the arguments are those of `make_table`."""
+    fields: list[tuple[str, Any, Any]] = [("kind", Literal[kind], kind)]
     for name, declaration in declared.items():
         scaled = declaration.default is None or isinstance(declaration.default, Scaled)
         type_ = declaration.type(body)
@@ -127,13 +91,12 @@ def extend_table(
         "__module__": part_class.__module__,
         "part_class": part_class,
         "declared": declared,
+        "body": body,
         "scaled": {name: value.default for name, value in declared.items() if isinstance(value.default, Scaled)},
         "gains": tuple(dict.fromkeys((*gains_by_name, *base.gains))),
         "free_by_default": tuple(name for name, declaration in gains_by_name.items() if declaration.free is True),
         "free_if_sampled": tuple(name for name, declaration in gains_by_name.items() if declaration.free == "sampled"),
-        **class_variables,
     }
-    kinds = [("kind", Literal[kind], kind)]
     return msgspec.defstruct(
-        part_class.__name__, kinds + fields, bases=(base,), frozen=True, kw_only=True, namespace=class_variables
+        part_class.__name__, fields, bases=(base,), frozen=True, kw_only=True, namespace=class_variables
     )
