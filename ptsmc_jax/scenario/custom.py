@@ -64,20 +64,12 @@ def custom_kind(
     return msgspec.defstruct("Custom", fields, bases=(Custom, table), frozen=True, kw_only=True, namespace=namespace)
 
 
-def find_code_keys(file: Mapping[str, Any]) -> Iterator[tuple[dict, str]]:
-    """Yield each table of a parsed file that names custom code, nested tables included, and the key that names it."""
-    for table in _walk_tables(file):
-        for key in CODE_KEYS:
-            if isinstance(table.get(key), str):
-                yield table, key
-
-
-def _walk_tables(value: Any) -> Iterator[dict]:
-    children = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+def find_code_keys(value: Any) -> Iterator[tuple[dict, str]]:
+    """Yield each table in the tables of a file that names custom code, and the key that names it."""
     if isinstance(value, dict):
-        yield value
-    for child in children:
-        yield from _walk_tables(child)
+        yield from ((value, key) for key in CODE_KEYS if isinstance(value.get(key), str))
+    for child in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+        yield from find_code_keys(child)
 
 
 def code_by_key(scenario: Table) -> dict[str, str]:

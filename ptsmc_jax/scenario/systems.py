@@ -16,28 +16,19 @@ import traceback
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
-from typing import NamedTuple
 
 from ptsmc_jax import configure
 from ptsmc_jax.plants.second_order import System
 
 NAME_FORMS = '"FILE.py:NAME" or "package.module:NAME"'
 SYSTEM_NAME_FORMS = f"{NAME_FORMS}, a system made with plants.system"
-LONGEST_PATH = 4096  # characters of a path, on Linux
 OWN_PACKAGES = ("ptsmc_jax", "tuning")  # packages that are never helpers of custom code
-
-
-class _ExecutedFile(NamedTuple):
-    """A file that was run."""
-
-    module: ModuleType
-    helpers: dict[str, str | None]  # files beside it that were imported, by path: their SHA-256
 
 
 _NO_DERIVATIVES = re.compile("support JVP|Differentiation rule for")  # in JAX's messages for code without derivatives
 _executed_paths: set[str] = set()  # real paths of all files that were run
-_executed_files: dict[tuple[str, str], _ExecutedFile] = {}  # by path and SHA-256, so that a changed file is run again
-# helper modules that custom files imported from their own folder: path and SHA-256 by name
+_executed_files: dict[tuple[str, str], ModuleType] = {}  # by path and checksum, so that a changed file is run again
+# modules that custom files imported from their own folder: path and SHA-256 by name
 _helpers: dict[str, tuple[str, str | None]] = {}
 
 
@@ -48,9 +39,8 @@ def split_name(qualified_name: str, allowed: str) -> tuple[str, str]:
     """
     place, _, name = qualified_name.rpartition(":")
     file = place.endswith(".py")
-    if not name.isidentifier() or len(qualified_name) > LONGEST_PATH or not qualified_name.isprintable():
-        place = ""
-    if not place or not (file or all(part.isidentifier() for part in place.split("."))):
+    is_module = all(part.isidentifier() for part in place.split("."))
+    if not name.isidentifier() or not qualified_name.isprintable() or not (file or is_module):
         raise ValueError(f"it names nothing; allowed is {allowed}")
     return place, name
 
@@ -91,11 +81,15 @@ def load_object(qualified_name: str, allowed: str) -> object:
         ValueError: there is no such file or name, or running it fails; the message has one line.
     """
     place, name = split_name(qualified_name, allowed)
-    path = Path(place)
-    content = _read_file(path) if place.endswith(".py") else b""
+    try:
+        content = Path(place).read_bytes() if place.endswith(".py") else b""
+    except FileNotFoundError:
+        raise ValueError(f"the file {place} does not exist") from None
+    except OSError as error:
+        raise ValueError(f"it cannot be read: {error.strerror}") from None
     try:
         with _importing_from(_import_folder(place)):
-            module = _run_file(path, content) if place.endswith(".py") else importlib.import_module(place)
+            module = _run_file(Path(place), content) if place.endswith(".py") else importlib.import_module(place)
     except (Exception, SystemExit) as error:
         raise ValueError(f"running {place} fails: {describe_failure(error, place)}") from error
     _executed_paths.add(os.path.realpath(getattr(module, "__file__", None) or place))
@@ -144,10 +138,10 @@ def checksum(qualified_name: object) -> str | None:
         file = None if spec is None else spec.origin
     if not file or sha256(file) is None:
         return None
-    first, *others = list_imported_files(Path(file), Path(_import_folder(place)))
-    if not others:
-        return sha256(str(first))
-    checksums = sorted((source.name, str(sha256(str(source)))) for source in (first, *others))
+    files = list_imported_files(Path(file), Path(_import_folder(place)))
+    if len(files) == 1:
+        return sha256(file)
+    checksums = sorted((source.name, str(sha256(str(source)))) for source in files)
     return hashlib.sha256(repr(checksums).encode()).hexdigest()
 
 
@@ -176,15 +170,6 @@ def _module_files(module: Path) -> list[Path]:
     return [*filter(Path.is_file, [module.with_suffix(".py")])]
 
 
-def _read_file(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except (FileNotFoundError, NotADirectoryError):
-        raise ValueError(f"the file {path} does not exist") from None
-    except OSError as error:
-        raise ValueError(f"it cannot be read: {error.strerror}") from None
-
-
 def _import_folder(place: str) -> str:
     """Return the folder that custom code can import from: the folder of the file, or the current folder."""
     return os.path.realpath(Path(place).parent if place.endswith(".py") else Path.cwd())
@@ -207,12 +192,11 @@ def _run_file(path: Path, content: bytes) -> ModuleType:
     Files of the same name in different folders, and their helper modules, are kept apart. The source itself is run,
     never a compiled copy from a __pycache__ folder.
     """
-    key = os.path.realpath(path), hashlib.sha256(content).hexdigest()
-    executed = _executed_files.get(key)
-    if executed is not None and all(sha256(file) == sha for file, sha in executed.helpers.items()):
-        return executed.module
-    folder = _import_folder(str(path))
-    if not all(file.startswith(folder + os.sep) and sha256(file) == sha for file, sha in _helpers.values()):
+    key = os.path.realpath(path), checksum(f"{path}:") or ""
+    if key in _executed_files:
+        return _executed_files[key]
+    folder = _import_folder(str(path)) + os.sep
+    if not all(file.startswith(folder) and sha256(file) == sha for file, sha in _helpers.values()):
         for name in _helpers:  # remove all helpers, since they may import each other
             sys.modules.pop(name, None)
         _helpers.clear()
@@ -230,19 +214,12 @@ def _run_file(path: Path, content: bytes) -> ModuleType:
         del sys.modules[spec.name]
         raise
     finally:
-        _helpers.update(_imported_helpers(folder, before))
-    _executed_files[key] = _ExecutedFile(module, dict(_helpers.values()))
+        for name in set(sys.modules) - before:
+            package, file = name.partition(".")[0], os.path.realpath(getattr(sys.modules[name], "__file__", None) or "")
+            if package not in before and package not in OWN_PACKAGES and file.startswith(folder + package):
+                _helpers[name] = file, sha256(file)
+    _executed_files[key] = module
     return module
-
-
-def _imported_helpers(folder: str, before: set[str]) -> dict[str, tuple[str, str | None]]:
-    """Return path and SHA-256, by name, of the modules that were imported from a folder since `before`."""
-    helpers = {}
-    for name in set(sys.modules) - before:
-        package, file = name.partition(".")[0], os.path.realpath(getattr(sys.modules[name], "__file__", None) or "")
-        if package not in OWN_PACKAGES and package not in before and file.startswith(os.path.join(folder, package)):
-            helpers[name] = file, sha256(file)
-    return helpers
 
 
 def sha256(file: str) -> str | None:

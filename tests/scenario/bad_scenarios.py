@@ -40,7 +40,7 @@ BAD = [
         "hardware.star_tracker_every is 100000000000000000000000000",
         "at most the 800 control periods",
     ),
-    (CUSTOM % ("a" * 5000 + ".py:arm"), 'plant.system is "', "it names nothing; allowed is"),
+    (CUSTOM % ("a" * 5000 + ".py:arm"), 'plant.system is "', "it cannot be read: File name too long"),
     (CUSTOM % ("a" * 300 + ".py:arm"), 'plant.system is "', "it cannot be read: File name too long"),
     (CUSTOM % "a\\u0000b.py:arm", r'plant.system is "a\u0000b.py:arm"', "it names nothing; allowed is"),
     (CUSTOM % "a\\u001b[2K.py:arm", r'plant.system is "a\u001b[2K.py:arm"', "it names nothing; allowed is"),
