@@ -4,6 +4,7 @@
 """
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 from ptsmc_jax.scenario import custom, epochs, errors, identify_tables, tables
@@ -172,75 +173,71 @@ def _check_periods(scenario: Scenario) -> None:
 
 
 def _check_dispersion(scenario: Scenario) -> None:
-    dispersion = scenario.dispersion
+    names = scenario.dispersion.__struct_fields__ if scenario.dispersion is not None else ()
+    random = {name: getattr(scenario.dispersion, name) for name in names}
+    random = {name: table for name, table in random.items() if table is not None}
+    for key in {"actuator_scale", "actuator_misalignment", "timing_jitter"} & random.keys():
+        scenario.require_sampled_loop(f"dispersion.{key}")
+    _check_disturbance_dispersions(scenario, random)
+    for key, needed in _absent_needs(scenario).items():
+        if key in random:
+            raise ScenarioError(f"dispersion.{key} needs {needed}")
+    for low, high in (("min_deg", "max_deg"), ("earliest", "latest"), ("smallest", "largest")):
+        for name, table in random.items():
+            smallest, largest = getattr(table, low, None), getattr(table, high, None) or scenario.end
+            if smallest is not None and smallest > largest:
+                raise wrong(f"dispersion.{name}.{low}", smallest, f"at most {high}, {largest}")
+    if "timing_jitter" in random and not random["timing_jitter"].largest < 0.5:
+        raise wrong(
+            "dispersion.timing_jitter.largest", random["timing_jitter"].largest, "below 0.5, half a control period"
+        )
+    if "x0" in random:
+        key, state_count = random["x0"].width_key, len(scenario.plant.x0)
+        value = getattr(random["x0"], key)
+        if len(value) != state_count:
+            raise wrong(f"dispersion.x0.{key}", value, f"a list of {state_count} numbers, one for each state")
+
+
+def _absent_needs(scenario: Scenario) -> dict[str, str]:
+    """Return the dispersions that this scenario cannot have, and what each of them needs."""
+    devices = scenario.devices
+    absent = {
+        key: f"hardware.{key}, which is absent"
+        for key, nominal_keys in devices.nominal_keys.items()
+        if all(getattr(devices, one) is None for one in nominal_keys)
+    }
+    for key, name in (("star_tracker_misalignment", "attitude_noise"), ("gyro_scale", "rate_noise")):
+        if name in absent:
+            absent[key] = f"{absent[name]}; {name} = 0 is allowed"
+    if scenario.reaction_wheels is None:
+        absent["wheel_failure"] = "reaction wheels, but there is no [wheels] table"
+    if not scenario.estimator.on:
+        needed = "an attitude filter, which estimates the attitude in the outage"
+        absent["star_tracker_outage"] = f'{needed}; allowed is [filter] with kind = "steady_state"'
+    if getattr(scenario, "flexible", None) is None:
+        modes = "flexible modes, but there is no [flexible] table"
+        absent |= {"mode_frequency": modes, "mode_coupling": modes}
+    return absent
+
+
+def _check_disturbance_dispersions(scenario: Scenario, random: Mapping[str, Any]) -> None:
+    """Raise ScenarioError if no disturbance has the phase or the amplitude that is dispersed.
+
+    A custom disturbance declares them in `drawn`. A custom key of that name alone does not suffice.
+    """
     kinds: Any = scenario.TABLES["disturbance"]
     if getattr(scenario, "orbit", None) is not None:  # the gravity gradient of [orbit] has no dispersion
         kinds = {kind: one for kind, one in kinds.items() if kind != "gravity_gradient"}
+
+    def has(term: Any, quantity: str) -> bool:
+        if isinstance(term, custom.Custom):
+            return term.is_unloaded or quantity in term.part_class.drawn
+        return term.kind in kinds and hasattr(term, quantity)
+
     for article, quantity in (("a", "phase"), ("an", "amplitude")):
-        dispersed = getattr(dispersion, f"disturbance_{quantity}", None) is not None
-        if dispersed and not any(_has_random_key(term, quantity) for term in scenario.terms if term.kind in kinds):
+        if f"disturbance_{quantity}" in random and not any(has(term, quantity) for term in scenario.terms):
             allowed = " or ".join(errors.show(kind) for kind, one in kinds.items() if quantity in one.__struct_fields__)
             raise ScenarioError(
                 f"dispersion.disturbance_{quantity} needs a disturbance that has {article} {quantity}, but "
                 f"disturbance.kind is {errors.show(scenario.disturbance.kind)}; allowed is {allowed}"
             )
-    for key, nominal_keys in scenario.devices.nominal_keys.items():
-        has_nominal = any(getattr(scenario.devices, one) is not None for one in nominal_keys)
-        if getattr(dispersion, key, None) is not None and not has_nominal:
-            raise ScenarioError(f"dispersion.{key} needs hardware.{key}, which is absent")
-    _check_hardware_dispersions(scenario)
-    for key in ("attitude", "reference"):
-        angles = getattr(dispersion, key, None)
-        if angles is not None and getattr(angles, "min_deg", 0.0) > getattr(angles, "max_deg", 180.0):
-            raise wrong(f"dispersion.{key}.min_deg", angles.min_deg, f"at most max_deg, {angles.max_deg}")
-    initial_state = getattr(dispersion, "x0", None)
-    if initial_state is not None:
-        key, state_count = initial_state.width_key, len(scenario.plant.x0)
-        value = getattr(initial_state, key)
-        if len(value) != state_count:
-            raise wrong(f"dispersion.x0.{key}", value, f"a list of {state_count} numbers, one for each state")
-
-
-def _has_random_key(term: Any, quantity: str) -> bool:
-    """Whether a dispersion can change the phase or the amplitude of a disturbance.
-
-    A custom disturbance declares this in `drawn`. A custom key of that name alone does not suffice.
-    """
-    if isinstance(term, custom.Custom):
-        return term.is_unloaded or quantity in term.part_class.drawn
-    return hasattr(term, quantity)
-
-
-def _check_hardware_dispersions(scenario: Scenario) -> None:
-    dispersion, devices = scenario.dispersion, scenario.devices
-
-    def dispersed(*keys: str) -> list[str]:
-        return [key for key in keys if getattr(dispersion, key, None) is not None]
-
-    for key in dispersed("actuator_scale", "actuator_misalignment", "timing_jitter"):
-        scenario.require_sampled_loop(f"dispersion.{key}")
-    for key, name in (("star_tracker_misalignment", "attitude_noise"), ("gyro_scale", "rate_noise")):
-        has_nominal = any(getattr(devices, one) is not None for one in devices.nominal_keys.get(name, ()))
-        if dispersed(key) and not has_nominal:
-            raise ScenarioError(f"dispersion.{key} needs hardware.{name}, which is absent; {name} = 0 is allowed")
-    if dispersed("wheel_failure") and scenario.reaction_wheels is None:
-        raise ScenarioError("dispersion.wheel_failure needs reaction wheels, but there is no [wheels] table")
-    if dispersed("star_tracker_outage") and not scenario.estimator.on:
-        raise ScenarioError(
-            "dispersion.star_tracker_outage needs an attitude filter, which estimates the attitude in the outage; "
-            'allowed is [filter] with kind = "steady_state"'
-        )
-    for key in dispersed("star_tracker_outage", "wheel_failure"):
-        times = getattr(dispersion, key)
-        latest = scenario.end if times.latest is None else times.latest
-        if times.earliest > latest:
-            raise wrong(f"dispersion.{key}.earliest", times.earliest, f"at most {latest}, the latest time")
-    for key in dispersed("timing_jitter"):
-        jitter = getattr(dispersion, key)
-        if not jitter.largest < 0.5:
-            raise wrong(f"dispersion.{key}.largest", jitter.largest, "below 0.5, half a control period")
-        if jitter.smallest > jitter.largest:
-            raise wrong(f"dispersion.{key}.smallest", jitter.smallest, f"at most {jitter.largest}, the largest")
-    for key in dispersed("mode_frequency", "mode_coupling"):
-        if getattr(scenario, "flexible", None) is None:
-            raise ScenarioError(f"dispersion.{key} needs flexible modes, but there is no [flexible] table")

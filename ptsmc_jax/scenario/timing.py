@@ -31,6 +31,12 @@ from ptsmc_jax.theory.exact_motion import plant_motion
 MOST_SUBSTEPS = 200  # largest number of integration steps in a control period
 # keys of smooth motions: steps of 0.1 rad are accurate enough, see `_count_substeps`
 _SMOOTH_MOTIONS = ("disturbance.frequency", "plant.system", "flexible.frequency")
+_REMEDIES = {  # how a key must change, other than to lower numbers, so that a run needs fewer steps
+    "reference.duration": "longer",
+    "controller.t_f": "longer",
+    "controller.sign_width": "larger, or 0 for the discontinuous sign",
+    "loop.t_end": "earlier",
+}
 
 
 @dataclass(frozen=True)
@@ -106,7 +112,9 @@ def choose_timing(scenario: Scenario, setup: Setup, reach: Reach, saves: object)
     Raises:
         ScenarioError: the run would need too many steps; the message names the key that causes them.
     """
-    loop, frequencies, visited = scenario.loop, _frequencies_by_key(scenario, setup, reach), None
+    loop, visited = scenario.loop, None
+    disturbed = {"disturbance.frequency": max(term.largest_frequency() for term in scenario.terms)}
+    frequencies = disturbed | scenario.frequencies(setup, reach.smallest_t_f)  # [rad/s], by the key that causes them
     if reach.t_f > scenario.controller.t_f:
         scenario.check_reference_until(scenario.end + reach.t_f - scenario.controller.t_f)
     if setup.plant.custom_functions:
@@ -142,13 +150,7 @@ def _check_steps(scenario: Scenario, last_time: float, period: float, substeps: 
         )
         if last_time > scenario.end:
             raise ScenarioError(f"tune.bounds.t_f asks for runs of {last_time:.6g} s, but must be lower: {reason}")
-        raise wrong("loop.t_end", scenario.loop.t_end, f"earlier: {reason}")
-
-
-def _frequencies_by_key(scenario: Scenario, setup: Setup, reach: Reach) -> dict[str, float]:
-    """Return the angular frequencies of disturbance and plant [rad/s], by the key that causes each of them."""
-    disturbed = {"disturbance.frequency": max(term.largest_frequency() for term in scenario.terms)}
-    return disturbed | scenario.frequencies(setup, reach.smallest_t_f)
+        raise _too_fast_error(scenario, "loop.t_end", reason)
 
 
 def _fastest_frequency(frequencies: Mapping[str, float]) -> float:
@@ -176,25 +178,16 @@ def _count_substeps(scenario: Scenario, period: float, frequencies: Mapping[str,
 
 
 def _too_fast_error(scenario: Scenario, key: str, reason: str) -> ScenarioError:
-    if key == "plant.system":
-        return ScenarioError(f"plant.system is too fast, in its own modes or in time: {reason}")
-    table, _, name = key.partition(".")
-    if name == "code":
-        return ScenarioError(f"{key} says that it is too fast: {reason}")
-    if key in ("reference.file", "reference.kind"):
-        shown = show(getattr(getattr(scenario, table), name))
-        return ScenarioError(f"{key} is {shown}, whose attitude is too fast: {reason}")
-    if key == "controller.eta":  # blame t_f, because eta may be at its lower bound already
-        eta = f"with controller.eta = {scenario.controller.eta}"
-        shorter = ", or loop.period shorter" if scenario.sampled else ""
-        return wrong("controller.t_f", scenario.controller.t_f, f"longer {eta}{shorter}: {reason}")
-    *tables, name = name.split(".")
-    value = getattr(functools.reduce(getattr, tables, getattr(scenario, table)), name, None)
-    if value is None:  # the key belongs to terms of a sum of disturbances
-        value = [getattr(term, name) for term in scenario.terms if hasattr(term, name)]
-    if value == []:
-        return ScenarioError(f"{table} is too fast: {reason}")
-    return wrong(key, value, f"{'longer' if key in ('reference.duration', 'controller.t_f') else 'lower'}: {reason}")
+    """Return the error for a run that needs too many steps, mainly because of this key."""
+    key = "controller.t_f" if key == "controller.eta" else key  # eta may be at its lower bound already
+    table, *names = key.split(".")
+    value = functools.reduce(lambda one, name: getattr(one, name, None), names, getattr(scenario, table))
+    if value is None:  # the key belongs to terms of a sum of disturbances, or to none of them
+        value = [getattr(term, names[-1]) for term in scenario.terms if hasattr(term, names[-1])]
+    if not value or names[-1] in ("system", "code", "file", "kind"):
+        named = f"{key} is {show(value)}, which" if isinstance(value, str) else key if value else table
+        return ScenarioError(f"{named} is too fast: {reason}")
+    return wrong(key, value, f"{_REMEDIES.get(key, 'lower')}: {reason}")
 
 
 @programs.jit  # compiled as one program instead of one for each operation
@@ -283,11 +276,7 @@ def _continuous_grid(
         if not steps_by_key["disturbance.frequency"] <= MOST_STEPS:  # the switching term gets faster with it, too
             main_cause = "disturbance.frequency"
         if steps_by_key[main_cause] <= steps_for() * 1.5:
-            raise wrong("loop.t_end", t_end, f"earlier: {reason}")
-        if main_cause == "controller.sign_width":
-            raise wrong(
-                main_cause, scenario.controller.sign_width, f"larger, or 0 for the discontinuous sign: {reason}"
-            )
+            main_cause = "loop.t_end"
         raise _too_fast_error(scenario, main_cause, reason)
     grid = clock.graded_clock(
         reach.t_f, reach.smallest_delta, t_end, scenario.window, rate, frequency, layer_rates, saves, order
