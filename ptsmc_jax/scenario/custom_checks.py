@@ -84,44 +84,35 @@ class _Checker:
             reason = describe_failure(error, inspect.getsourcefile(self._made) or "")
             raise ScenarioError(f"{self._beginning} {method} {reason}") from None
 
-    def error(self, method: str, returns: str, allowed: str) -> ScenarioError:
+    def error(self, method: str, returned: str, allowed: str) -> ScenarioError:
         """Return the error for a returned value.
 
         Args:
             method: name of the method.
-            returns: description of the returned value.
+            returned: description of the returned value.
             allowed: description of the required value.
         """
-        return ScenarioError(f"{self._beginning} {method} returns {returns} at t = 0, but must return {allowed}")
+        return ScenarioError(f"{self._beginning} {method} returns {returned} at t = 0, but must return {allowed}")
 
-    def check_array(self, method: str, description: str, value: Any, shape: tuple[int, ...]) -> None:
-        """Raise ScenarioError if a value is not an array, not finite, or of another shape.
+    def check(self, method: str, allowed: str, value: Any, example: Any, *, exact: bool = False) -> None:
+        """Raise ScenarioError if a value has not the structure and shapes of an example.
 
         Args:
             method: name of the method that returned it.
-            description: description of the value.
+            allowed: description of the required value.
             value: the value.
-            shape: the required shape.
+            example: a pytree of arrays.
+            exact: whether types of numbers must be equal, too, as in a memory. Otherwise real numbers are required.
         """
-        if not isinstance(value, jax.Array | np.ndarray):
-            raise self.error(method, f"{description} that is a {type(value).__name__}", f"an array of shape {shape}")
-        array = np.asarray(value)
-        if array.shape != shape:
-            raise self.error(method, f"{description} of shape {array.shape}", f"one of shape {shape}")
-        if array.dtype.kind not in "iuf" or not np.all(np.isfinite(array)):
-            raise self.error(method, f"{description} {array.tolist()}", "finite real numbers")
+        found, expected = _describe(value, exact), _describe(example, exact)
+        if found != expected:
+            raise self.error(method, found, f"{allowed}, of the form {expected}")
 
-    def check_memory(self, method: str, before: Any, after: Any) -> None:
-        """Raise ScenarioError if a memory changes its shapes or types.
-
-        Args:
-            method: name of the method that returned `after`.
-            before: the memory that it received.
-            after: the memory that it returned.
-        """
-        expected, found = (jax.tree.map(_type_and_shape, tree) for tree in (before, after))
-        if expected != found:
-            raise self.error(method, f"a memory {found}", f"one as begin does, {expected}")
+    def check_finite(self, method: str, value: Any, occasion: str = "") -> None:
+        """Raise ScenarioError if a pytree has numbers that are not finite; `occasion`: end of the sentence."""
+        for number in map(np.asarray, jax.tree.leaves(value)):
+            if not np.all(np.isfinite(number)):
+                raise self.error(method, f"{number.tolist()}", f"finite numbers{occasion}")
 
 
 def _check_tracing(function: Callable, args: tuple) -> None:
@@ -134,91 +125,64 @@ def _check_tracing(function: Callable, args: tuple) -> None:
     jax.eval_shape(lambda owner, args: unbound(owner, *args), owner, args)
 
 
-def _type_and_shape(value: Any) -> str:
-    """Return the type and shape of an array, such as f64(3,)."""
-    return f"{value.dtype.name.replace('float', 'f')}{value.shape}"
+def _describe(value: Any, exact: bool) -> str:
+    """Return the structure of a pytree with the type and shape of each array, such as (f64(3,), nothing)."""
 
+    def describe_array(array: Any) -> str:
+        array = np.asarray(array)
+        is_real = array.dtype.kind in "iuf" and not exact
+        return f"{'real' if is_real else array.dtype.name.replace('float', 'f')}{array.shape}"
 
-def _describe(returned: Any) -> str:
-    """Describe a returned value in words."""
-    if returned is None:
-        return "nothing"
-    if isinstance(returned, jax.Array):
-        return f"an array of shape {returned.shape}"
-    if isinstance(returned, tuple | list):
-        return f"{'a list of ' if isinstance(returned, list) else ''}{len(returned)} values"
-    return f"a {type(returned).__name__}"
-
-
-def _describe_change(parts: Parts, changed: Parts) -> str:
-    """Describe the first part whose structure has changed."""
-    for field in dataclasses.fields(parts):
-        before, after = (getattr(either, field.name) for either in (parts, changed))
-        if jax.tree.structure(before) != jax.tree.structure(after):
-            return f"{field.name} {_describe_part(after)} instead of {_describe_part(before)}"
-    return "a different structure"
-
-
-def _describe_part(part: Any) -> str:
-    return "absent" if part is None else _describe(part)
+    return str(jax.tree.map(describe_array, value)).replace("'", "").replace("None", "nothing")
 
 
 def _check_disturbance(parts: Parts, signal: Any, call: _Checker) -> None:
     d = call("__call__", signal, jnp.zeros_like(parts.t_end), parts.initial)
-    call.check_array("__call__", "a disturbance", d, (parts.plant.inputs,))
+    call.check("__call__", "a number for each input", d, jnp.zeros(parts.plant.inputs))
+    call.check_finite("__call__", d)
 
 
 def _check_reference(parts: Parts, call: _Checker) -> None:
     q = call("attitude", parts.reference.attitude, jnp.zeros_like(parts.t_end))
-    call.check_array("attitude", "an attitude", q, (4,))
-    if abs(float(jnp.sum(q * q)) - 1.0) > 1e-9:
-        raise call.error("attitude", f"the quaternion {np.asarray(q).tolist()}", "one of length 1")
+    call.check("attitude", "a quaternion", q, jnp.zeros(4))
+    if not abs(float(jnp.sum(q * q)) - 1.0) < 1e-9:
+        raise call.error("attitude", f"{q.tolist()}", "a quaternion of length 1")
     target = call("attitude", parts.reference, jnp.zeros_like(parts.t_end))
-    call.check_array("attitude", "an attitude whose second derivative is", target.w_dot, (3,))
+    call.check_finite("attitude", target, " with two finite derivatives")
 
 
 def _check_sensors(parts: Parts, call: _Checker) -> None:
     custom, zero = parts.sensors.custom, jnp.zeros(())
     x = parts.controller.kinematics.align(parts.plant.visible(parts.initial), parts.reference(zero))
     memory = call("begin", custom.begin, x)
-    period = jnp.asarray(parts.period)
-    returned = call("see", custom.see, memory, x, jnp.zeros(custom.draws), zero, period)
-    if not isinstance(returned, tuple) or len(returned) != 2:
-        raise call.error("see", _describe(returned), "two values, the measured state and its memory")
-    expected, found = (jax.tree.map(_type_and_shape, one) for one in (jax.tree.map(jnp.asarray, x), returned[0]))
-    if expected != found:
-        raise call.error("see", f"a state {found}", f"one as the plant's, {expected}")
-    call.check_memory("see", memory, returned[1])
-    first = call("see", custom.see, memory, x, jnp.zeros(custom.draws), zero, zero)
-    for (measured, _), occasion in ((returned, ""), (first, ", also at the first sample, where dt is 0")):
-        if not all(np.all(np.isfinite(v)) for v in jax.tree.leaves(measured)):
-            raise call.error("see", f"a state {jax.tree.map(np.asarray, measured)}", f"finite numbers{occasion}")
+    for dt, occasion in ((jnp.asarray(parts.period), ""), (zero, ", also at the first sample, where dt is 0")):
+        returned = call("see", custom.see, memory, x, jnp.zeros(custom.draws), zero, dt)
+        call.check("see", "the measured state and the memory", returned, (x, memory), exact=True)
+        call.check_finite("see", returned[0], occasion)
 
 
 def _check_draw(parts: Parts, dispersion: Dispersion, call: _Checker) -> None:
     custom: Any = dispersion.custom
-    row_names = {*RESULT_COLUMNS, *RESULT_COLUMNS.values()}
-    used_names = {"status", "reason", "bad_time", *row_names, *CATALOGUE, *dispersion.values(parts)}
     c = jnp.full(custom.count, 0.5)
     changed = call("at", custom.at, c, parts)
-    before, after = (jax.tree.map(lambda v: _type_and_shape(jnp.asarray(v)), tree) for tree in (parts, changed))
-    if jax.tree.structure(before) != jax.tree.structure(after):
-        shown = f"parts with {_describe_change(parts, changed)}" if isinstance(changed, Parts) else _describe(changed)
+    if jax.tree.structure(parts) != jax.tree.structure(changed):
+        names = [field.name for field in dataclasses.fields(parts) if isinstance(changed, Parts)]
+        trees = {name: (getattr(parts, name), getattr(changed, name)) for name in names}
+        differing = [name for name, trees in trees.items() if len(set(map(jax.tree.structure, trees))) > 1]
+        shown = f"parts with another {' and '.join(differing)}" if differing else f"a {type(changed).__name__}"
         raise call.error("at", shown, "the same parts with other numbers (use dataclasses.replace)")
-    for expected, found, value in zip(*map(jax.tree.leaves, (before, after, changed)), strict=True):
-        if expected != found:
-            raise call.error("at", f"parts with {found} instead of {expected}", "numbers of the same shapes")
-        if not np.all(np.isfinite(value)):
-            raise call.error("at", "parts with numbers that are not finite", "finite ones")
+    for before, after in zip(jax.tree.leaves(parts), jax.tree.leaves(changed), strict=True):
+        call.check("at", "parts with numbers of the same shapes", after, before, exact=True)
+        call.check_finite("at", after)
     values = call("values", custom.values, c)
-    if not isinstance(values, dict) or not all(isinstance(name, str) for name in values):
-        raise call.error("values", _describe(values), "a dict of numbers by name")
-    for name, value in values.items():
-        call.check_array("values", f"a number {name}", value, ())
-        if name in used_names:
-            raise call.error("values", f"a number {name}", "a name that no column of the result file has")
-        if not is_column_name(name):
-            raise call.error("values", f"a number {name!r}", "a printable name")
+    names = values if isinstance(values, dict) else ()
+    call.check("values", "a dict of numbers by name", values, dict.fromkeys(names, 0.0))
+    call.check_finite("values", values)
+    row_names = {*RESULT_COLUMNS, *RESULT_COLUMNS.values()}
+    used_names = {"status", "reason", "bad_time", *row_names, *CATALOGUE, *dispersion.values(parts)}
+    for name in names:
+        if not isinstance(name, str) or name in used_names or not is_column_name(name):
+            raise call.error("values", f"a number {name!r}", "printable names that no column of the result file has")
 
 
 def _check_observer(parts: Parts, call: _Checker) -> None:
@@ -226,34 +190,35 @@ def _check_observer(parts: Parts, call: _Checker) -> None:
     memory = call("begin", observer.begin)
     period = jnp.asarray(parts.period)
     new_memory = call("step", observer.step, memory, jnp.zeros(m), period, period)
-    call.check_memory("step", memory, new_memory)
-    call.check_array("estimate", "an estimate", call("estimate", observer.estimate, new_memory), (m,))
+    call.check("step", "a memory as begin does", new_memory, memory, exact=True)
+    estimate = call("estimate", observer.estimate, new_memory)
+    call.check("estimate", "a number for each input", estimate, jnp.zeros(m))
     bound = observer.error_bound()
     if not isinstance(bound, Bound):
         allowed = "a bound such as ptsmc_jax.observers.base.constant_bound(K, components)"
-        raise call.error("error_bound", _describe(bound), allowed)
-    call.check_array("error_bound", "a bound", call("error_bound", bound.__call__, period), ())
+        raise call.error("error_bound", f"a {type(bound).__name__}", allowed)
+    largest = call("error_bound", bound.__call__, period)
+    call.check("error_bound", "a number", largest, period)
+    call.check_finite("error_bound", (estimate, largest))
 
 
 def _check_law(parts: Parts, call: _Checker) -> None:
     law: Any = parts.controller
-    zero, m = jnp.zeros_like(parts.t_end), parts.plant.inputs
+    zero, u = jnp.zeros_like(parts.t_end), jnp.zeros(parts.plant.inputs)
     target = parts.reference(zero)
     x = law.kinematics.align(parts.plant.visible(parts.initial), target)
     k2, memory = parts.observer.error_bound()(zero), call("begin", law.begin)
     now = Sample(zero, jnp.asarray(False), jnp.asarray(parts.period), memory)
-    expected = ("an acceleration", "a sliding variable", *(() if memory is None else ("its memory",)))
     method, function, arguments = "acceleration", law.acceleration, (now, *law.kinematics.errors(x, target), k2)
+    has_memory = memory is not None
     if type(law).__call__ is not Law.__call__:
-        expected = ("an input", "a sliding variable", "its memory")
-        method, function, arguments = "__call__", law.__call__, (now, x, target, jnp.zeros(m), k2)
+        method, function, arguments, has_memory = "__call__", law.__call__, (now, x, target, u, k2), True
     returned = call(method, function, *arguments)
-    if not isinstance(returned, tuple) or len(returned) != len(expected):
-        raise call.error(method, _describe(returned), f"({', '.join(expected)})")
-    call.check_array(method, expected[0], returned[0], (m,))
-    call.check_array(method, expected[1], returned[1], (m,))
-    if len(expected) == 3:
-        call.check_memory(method, memory, returned[2])
+    allowed = f"an {'acceleration' if method == 'acceleration' else 'input'}, a sliding variable"
+    example = (u, u, memory) if has_memory else (u, u)
+    call.check(method, f"{allowed}, its memory" if has_memory else allowed, returned, example)
+    call.check_finite(method, returned[:2])
+    call.check(method, "a memory as begin does", returned[2:], example[2:], exact=True)
 
 
 _CHECKS = {  # by table

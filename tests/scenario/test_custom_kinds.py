@@ -312,19 +312,19 @@ RETURNS = "return 0.5 * wanted"
 # a part of the law, what replaces it, and the expected text about it and about the allowed values
 # fmt: off
 CHANGED = [
-    (f"{RETURNS}, s", "return jnp.zeros(2), s", "acceleration", "shape"),
-    (f"{RETURNS}, s", "return [0.5 * wanted[0]], s", "returns an acceleration that is a list", "array of shape (1,)"),
-    (f"{RETURNS}, s", "return [0.5 * wanted, s]", "returns a list of 2 values", "(an acceleration, a sliding"),
-    (f"{RETURNS}, s", RETURNS, "returns an array of shape (1,)", "an acceleration, a sliding variable"),
+    (f"{RETURNS}, s", "return jnp.zeros(2), s", "acceleration returns (real(2,), real(1,))", "(real(1,), real(1,))"),
+    (f"{RETURNS}, s", "return [0.5 * wanted[0]], s", "returns ([real()], real(1,))", "form (real(1,), real(1,))"),
+    (f"{RETURNS}, s", "return [0.5 * wanted, s]", "returns [real(1,), real(1,)]", "an acceleration, a sliding"),
+    (f"{RETURNS}, s", RETURNS, "returns real(1,)", "an acceleration, a sliding variable"),
     (f"{RETURNS}, s", "0.5 * wanted, s", "acceleration returns nothing", "a sliding variable"),
     # an earlier version ran this as 0 and 1, and margins ended in a traceback
-    (f"{RETURNS}, s", f"{RETURNS}, s > 0.0", "returns a sliding variable [", "must return finite real numbers"),
+    (f"{RETURNS}, s", f"{RETURNS}, s > 0.0", "returns (real(1,), bool(1,))", "of the form (real(1,), real(1,))"),
     # an earlier error named the class MineOnErrorOfChain
     (RETURNS, "return self.width_ * wanted", "AttributeError: 'Mine' object has no attribute 'width_'", "line 21 of"),
     ("def acceleration", "def accelerate", "the class Mine has no method", "acceleration or __call__"),
     (f"{RETURNS}, s", "return 1 / 0 * wanted, s", "acceleration fails", "line 21 of mine.py"),
     (RETURNS, "exit(0)", "acceleration fails: SystemExit", "line 21 of mine.py"),
-    (RETURNS, "return jnp.log(-1.0) * wanted", "returns an acceleration [nan]", "finite real numbers"),
+    (RETURNS, "return jnp.log(-1.0) * wanted", "returns [nan]", "finite numbers"),
     (RETURNS, "return wanted if wanted[0] > 9.0 else 0.5 * wanted", "needs the value of a traced number",
      "jax.numpy.where instead of if"),
     (RETURNS, "return float(wanted[0]) * wanted", "needs the value", "jax.numpy instead of numpy and float()"),
@@ -340,9 +340,9 @@ CHANGED = [
     ("width: float = 1e-3", "width: float", "cannot have such fields", "width"),
     *(("width: float", f"{name}: float", f"the class Mine has a field {name}", "already uses")
       for name in ("code", "check", "order")),
-    ("width: float", "kinematics: float", "the class Mine cannot have such fields", "names the base class does not use"),
+    ("width: float", "kinematics: float", "the class Mine cannot have such fields", "the base class does not use"),
     ("width: float = 1e-3", "t_f: float = 1.0", "the class Mine has a field t_f", "another name"),
-    (RETURNS, "return 1j * wanted", "returns an acceleration [", "real numbers"),
+    (RETURNS, "return 1j * wanted", "returns (complex128(1,), real(1,))", "form (real(1,), real(1,))"),
 ]
 # the code, other keys of the scenario, and the expected text
 BAD = [
@@ -358,8 +358,8 @@ BAD = [
     (LAW, {"code": "gone.py:Mine"}, "the file gone.py does not exist", "gone.py"),
     (LAW, {"code": "mine"}, 'controller.code is "mine"', "FILE.py:NAME"),
     (LAW, {"code": None}, "controller.code is absent", "FILE.py:NAME"),
-    (REMEMBERS, {}, "acceleration returns 2 values", "a sliding variable, its memory"),
-    (REMEMBERS.replace("wanted, s", "wanted, s, jnp.zeros(2)"), {}, "acceleration returns a memory f64(2,)", "f64(1,)"),
+    (REMEMBERS, {}, "acceleration returns (real(1,), real(1,))", "a sliding variable, its memory"),
+    (REMEMBERS.replace("wanted, s", "wanted, s, jnp.zeros(2)"), {}, "returns (real(1,), real(1,), real(2,))", "real(1,))"),
 ]
 # fmt: on
 
@@ -396,12 +396,12 @@ OTHERS = {
         ("float(self.rates[1])", "None", "fastest returns nothing, but must return an angular frequency"),
         ("float(self.rates[1])", "float('nan')", "whose method fastest returns nan"),
         ("float(self.rates[1])", "-1.0", "whose method fastest returns -1.0"),
-        ("* jnp.ones(1)", "* jnp.ones(3)", "__call__ returns a disturbance of shape (3,)"),
-        ("jnp.sin(self.rates[0] * t)", "jnp.log(-1.0)", "returns a disturbance [nan]"),
+        ("* jnp.ones(1)", "* jnp.ones(3)", "__call__ returns real(3,)"),
+        ("jnp.sin(self.rates[0] * t)", "jnp.log(-1.0)", "__call__ returns [nan]"),
         ("(0.5, 1.5)", "(0.5, 1e9)", "disturbance.frequency"),
     ],
     "reference": [
-        ("jnp.cos(half)", "2.0 * jnp.cos(half)", "one of length 1"),
+        ("jnp.cos(half)", "2.0 * jnp.cos(half)", "a quaternion of length 1"),
         ("jnp.stack([0.0 * half, ", "jnp.stack([", "(4,)"),
         ("    def attitude", "    def fastest(self):\n        pass\n\n    def attitude",
          "Turning, whose method fastest returns nothing"),
