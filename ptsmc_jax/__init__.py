@@ -34,9 +34,9 @@ _NAMES = {
     "plants.second_order": "System system",
     "scenario": "Study from_tables read replace study",
     "scenario.errors": "ScenarioError",
+    "scenario.reading": "in_scenario",
     "scenario.tables": "Scenario",
     "scenario.timing": "Reach reach_of",
-    "scenario.tuned": "in_scenario",
     "signals.disturbances": "Constant Disturbance Sinusoid",
     "signals.references": "Fixed Reference Slew Spin Swing Target",
     "simulation.gains": "gains_of with_gains",
@@ -89,10 +89,10 @@ if TYPE_CHECKING:
     from ptsmc_jax.scenario import replace as replace
     from ptsmc_jax.scenario import study as study
     from ptsmc_jax.scenario.errors import ScenarioError as ScenarioError
+    from ptsmc_jax.scenario.reading import in_scenario as in_scenario
     from ptsmc_jax.scenario.tables import Scenario as Scenario
     from ptsmc_jax.scenario.timing import Reach as Reach
     from ptsmc_jax.scenario.timing import reach_of as reach_of
-    from ptsmc_jax.scenario.tuned import in_scenario as in_scenario
     from ptsmc_jax.signals.disturbances import Constant as Constant
     from ptsmc_jax.signals.disturbances import Disturbance as Disturbance
     from ptsmc_jax.signals.disturbances import Sinusoid as Sinusoid

@@ -23,7 +23,7 @@ from ptsmc_jax.identification.telemetry import Measurements
 from ptsmc_jax.numerics import attitude, matrices
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.plants.rigid_body import AttitudeState
-from ptsmc_jax.scenario import build as building
+from ptsmc_jax.scenario import assembly
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.parsing import nearest_name_hint
 from ptsmc_jax.scenario.sensor_tables import SensorSuite
@@ -138,7 +138,7 @@ def build(scenario: Scenario, logs: Sequence[Measurements], names: Sequence[str]
     Raises:
         ScenarioError: a parameter is unknown, or the scenario does not have it.
     """
-    setup = building.setup(scenario)
+    setup = assembly.build_setup(scenario)
     table = scenario.identify
     stated_names = None if table is None else table.free
     has_gyro = "rate" in logs[0].readings

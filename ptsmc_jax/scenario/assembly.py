@@ -1,17 +1,26 @@
 """Build everything that a run needs from a validated scenario: parts, dispersions, requirements. Start with `study`."""
 
+import dataclasses
 import typing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
 
 from ptsmc_jax import configure
-from ptsmc_jax.dispersions import variation
-from ptsmc_jax.numerics.pytrees import listing
-from ptsmc_jax.scenario import build, custom_checks, reading, start_checks, timing
+from ptsmc_jax.devices import reaction_wheels
+from ptsmc_jax.dispersions.base import INITIAL_ATTITUDE, INITIAL_RATE, INITIAL_STATE
+from ptsmc_jax.dispersions.quantities import QUANTITIES, level_name
+from ptsmc_jax.dispersions.variation import Dispersion
+from ptsmc_jax.numerics.pytrees import listing, vector
+from ptsmc_jax.plants.base import Plant
+from ptsmc_jax.scenario import custom_checks, reading, start_checks, timing
 from ptsmc_jax.scenario import tables as t
 from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation import catalogues
-from ptsmc_jax.simulation.assembly import Parts
+from ptsmc_jax.simulation.assembly import Parts, Setup
 from ptsmc_jax.simulation.requirements import Requirement
 
 
@@ -21,7 +30,7 @@ class Study:
 
     scenario: Scenario
     parts: Parts
-    dispersion: variation.Dispersion
+    dispersion: Dispersion
     requirements: tuple[Requirement, ...]  # on metrics of runs
     margins: tuple[Requirement, ...]  # on stability margins of the loop
 
@@ -107,9 +116,87 @@ def study(
         raise TypeError(f"a reach is needed, as reach_of(scenario) returns it, but this is a {type(reach).__name__}")
     configure.warn_if_not_configured()
     scenario = reading.complete(reading.to_scenario(scenario))
-    setup = build.setup(scenario)
+    setup = build_setup(scenario)
     parts = setup.with_clock(*timing.choose_timing(scenario, setup, reach or timing.reach_of(scenario), saves))
-    dispersion = build.dispersion(scenario, parts)
+    dispersion = build_dispersion(scenario, parts)
     custom_checks.check(parts, dispersion, scenario)
     start_checks.check(scenario, parts, dispersion, dispersed=drawn)
     return Study(scenario, parts, dispersion, requirements(scenario), margin_requirements(scenario))
+
+
+def build_setup(scenario: Scenario) -> Setup:
+    """Return all parts except the clock, which `timing.choose_timing` derives from the fastest rates of these parts."""
+    model = scenario.design_model()
+    plant = scenario.true_plant(model)
+    signal, walk_rate = build_disturbance(scenario, plant)
+    wheels = scenario.reaction_wheels
+    actuators = scenario.devices.actuators(None if wheels is None else wheels.build())
+    if getattr(getattr(scenario.dispersion, "wheel_failure", None), "known", False):
+        actuators = dataclasses.replace(
+            actuators, spare_allocations=reaction_wheels.spare_allocations(actuators.wheels)
+        )
+    command_filter = scenario.devices.command_filter
+    return Setup(
+        plant=plant,
+        disturbance=signal,
+        reference=scenario.build_reference(),
+        controller=scenario.controller.build(scenario, model),
+        observer=scenario.observer.build(scenario, model),
+        sensors=_sensors(scenario, model),
+        initial=plant.with_hidden_at_rest(scenario.initial_state()),
+        t_end=vector(scenario.end),
+        window=vector(scenario.window),
+        settling_angle=vector(scenario.loop.settling_angle),
+        actuators=actuators,
+        walk_rate=walk_rate,
+        command_filter=None if command_filter is None else command_filter.part(),
+        pointing=scenario.observation(),
+    )
+
+
+def _sensors(scenario: Scenario, model: Any) -> Any:
+    """Return the sensors of [sensors] or [[sensors]] if given, otherwise the sensors of [hardware]."""
+    if scenario.sensors is None:
+        return scenario.devices.sensors(scenario)
+    return scenario.sensors.build(model, scenario.loop.period)
+
+
+def build_disturbance(scenario: Scenario, plant: Plant) -> tuple[Any, Any]:
+    """Return the disturbance of the true plant, a function of time and state, and the rate of its random walk or None.
+
+    The rate of the random walk is one sigma per second for each input (m,).
+    """
+    signals, walk = [], None
+    inertia = getattr(plant, "inertia", None)
+    for table in scenario.terms:
+        signal, step = table.build(inertia, scenario), table.walk(scenario.loop.period)
+        signals += [] if signal is None else [signal]
+        if step is not None:
+            walk = step if walk is None else jnp.sqrt(walk**2 + step**2)  # variances of independent walks add up
+    if len(signals) > 1:
+        return disturbances.Sum(tuple(signals)), walk
+    return (signals[0] if signals else disturbances.Constant(jnp.zeros(plant.inputs))), walk
+
+
+def _dispersed_quantity(key: str) -> str:
+    """Return the name of the quantity that a key of [dispersion] disperses."""
+    initial_values = {"attitude": INITIAL_ATTITUDE, "rate": INITIAL_RATE, "x0": INITIAL_STATE}
+    return initial_values.get(key, level_name(key) if level_name(key) in QUANTITIES else key)
+
+
+def build_dispersion(scenario: Scenario, parts: Parts) -> Dispersion:
+    """Return the dispersions of a scenario about these nominal parts."""
+    table = scenario.dispersion
+    if table is None:
+        return Dispersion()
+    keys: tuple[str, ...] = table.__struct_fields__
+    tables: dict[str, Any] = {_dispersed_quantity(key): getattr(table, key) for key in keys if key != "custom"}
+    return Dispersion(
+        {
+            name: random.build(parts, QUANTITIES[name].count(parts))
+            for name, random in tables.items()
+            # zero hardware errors are omitted, so that the compiled program is the one without hardware errors
+            if random is not None and not (QUANTITIES[name].hardware and getattr(random, "is_zero", False))
+        },
+        custom=None if table.custom is None else table.custom.build(),
+    )

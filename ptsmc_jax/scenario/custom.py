@@ -16,9 +16,13 @@ import msgspec
 from msgspec import Meta
 
 from ptsmc_jax.declare import Declaration, Limits
+from ptsmc_jax.devices import custom_sensors
+from ptsmc_jax.dispersions.base import Draw
+from ptsmc_jax.numerics.draws import DISTRIBUTIONS
+from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.scenario import schema, systems
 from ptsmc_jax.scenario.errors import ScenarioError, brief, show
-from ptsmc_jax.scenario.values import Meaning, Table
+from ptsmc_jax.scenario.values import Kinds, Meaning, Table
 from ptsmc_jax.simulation.gains import is_reserved
 
 CODE_KEYS = ("system", "truth", "code")  # keys that name code, in any table
@@ -253,3 +257,49 @@ def _declaration(table: Any, custom_class: Any, field: dataclasses.Field) -> Dec
 
 def _is_number(value: object) -> typing.TypeGuard[float]:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+class SensorTable(schema.PartTable, frozen=True):
+    """Custom sensors. They replace the noise of [hardware] and the table [filter]."""
+
+    prefix: ClassVar[str] = "sensors_"
+
+    def build(self, model: Any, period: float) -> Any:
+        """Return the sensors for the rollout; `model`: the design model of the plant, `period`: control period [s]."""
+        part = self.part(model=model)
+        _check_field("sensors", part, "draws", _is_count(part.draws, 0), "a whole number of at least 0")
+        return custom_sensors.CustomSensors(part, vector(1.0))
+
+
+class DrawTable(schema.PartTable, frozen=True):
+    """Custom random quantities."""
+
+    def build(self) -> Any:
+        """Return the dispersion, an instance of `ptsmc_jax.Draw`."""
+        part = self.part()
+        _check_field("dispersion.custom", part, "count", _is_count(part.count, 1), "a whole number of at least 1")
+        _check_field("dispersion.custom", part, "drawn", part.drawn in DISTRIBUTIONS, '"normal" or "uniform"')
+        return part
+
+
+def _is_count(value: object, smallest: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= smallest
+
+
+def _check_field(table: str, part: Any, field: str, is_allowed: bool, allowed: str) -> None:
+    """Raise ScenarioError if a class has a field that is not allowed; `allowed`: the allowed values in words."""
+    if not is_allowed:
+        beginning = f"{table}.code is a class whose {field} is {show(getattr(part, field))}"
+        raise ScenarioError(f"{beginning}, but must be {allowed}")
+
+
+SENSORS: Kinds = {  # kinds of the table [sensors]; built-in sensors are set by [hardware] and [filter] instead
+    "custom": custom_kind(
+        SensorTable, custom_sensors.SampledSensor, ("see",), has_gains=True,
+        summary="Custom sensors, a class derived from ptsmc_jax.SampledSensor; its fields are further keys. They "
+        "replace the noise of [hardware] and the table [filter].",
+    )
+}  # fmt: skip
+CUSTOM_DRAW: Any = custom_kind(
+    DrawTable, Draw, ("at",), "A custom dispersion, a class derived from ptsmc_jax.Draw; its fields are further keys."
+)

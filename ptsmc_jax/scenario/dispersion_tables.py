@@ -15,7 +15,7 @@ from ptsmc_jax.declare import Scaled
 from ptsmc_jax.dispersions import numbers
 from ptsmc_jax.dispersions.numbers import RandomNumbers, any_attitude, axis_angle, interval
 from ptsmc_jax.numerics.pytrees import vector
-from ptsmc_jax.scenario.custom_devices import CUSTOM_DRAW
+from ptsmc_jax.scenario.custom import CUSTOM_DRAW
 from ptsmc_jax.scenario.values import Four, Kinds, Meaning, NotNegative, NotNegatives, Positive, Table, Three, Truth
 
 Angle = Annotated[float, Meta(ge=0, le=180, description="an angle from 0 to 180 degrees")]

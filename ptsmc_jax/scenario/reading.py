@@ -8,9 +8,10 @@ import msgspec
 
 from ptsmc_jax.declare import Scaled
 from ptsmc_jax.scenario import checks, custom, free_gains, layouts, mission, parsing
-from ptsmc_jax.scenario.errors import wrong
+from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.tables import Scenario, check_scenario
 from ptsmc_jax.scenario.values import Table
+from ptsmc_jax.simulation.gains import AXIS, base, gain_of_each_axis
 
 TIME_AFTER_T_F = Scaled(10.0, time=1)  # default time from t_f to the end of a run [s]
 
@@ -87,11 +88,6 @@ def complete(scenario: Scenario) -> Scenario:
     return from_tables(parsing.stated_tables(scenario), run=True) if custom.has_unloaded_code(scenario) else scenario
 
 
-def freeze_defaults(scenario: Scenario) -> Scenario:
-    """Return a scenario whose defaults count as stated values, so that `replace` does not change them."""
-    return msgspec.structs.replace(scenario, defaulted={})
-
-
 def replace(scenario: Scenario | str | Path, **changes: Any) -> Scenario:
     """Return a validated scenario with other values, such as replace(scenario, controller__eta=4.0).
 
@@ -136,3 +132,42 @@ def replace(scenario: Scenario | str | Path, **changes: Any) -> Scenario:
 def _default_kind(scenario: Scenario, table: str) -> str | None:
     kinds = layouts.SCENARIOS if table == "plant" else scenario.TABLES.get(table)
     return next(iter(kinds)) if isinstance(kinds, Mapping) else None
+
+
+def in_scenario(scenario: Scenario, gains: Mapping[str, Any]) -> Scenario:
+    """Return a validated scenario with other gains.
+
+    A new t_f moves the end of the run by the same time. All other values stay, defaults included.
+
+    Args:
+        scenario: a scenario or the path of its file.
+        gains: values by the names that `gains_of` returns.
+
+    Raises:
+        ScenarioError: a name is not a gain of the scenario, or a value is not allowed.
+        TypeError: `gains` is not a mapping.
+    """
+    scenario = to_scenario(scenario)
+    if not isinstance(gains, Mapping):
+        raise TypeError(f"gains are needed by name, such as {{'eta': 3.0}}, but this is a {type(gains).__name__}")
+    axes = list(getattr(scenario.observer, "gain", ()))
+    known_names = [*scenario.gains, *(f"{AXIS}{k + 1}" for k in range(len(axes)))]
+    for name in gains:
+        if name not in known_names:
+            raise ScenarioError(f"{name} is no gain of this scenario; allowed is some of {', '.join(known_names)}")
+        if gains[name] is None or (name == "t_f" and not hasattr(gains[name], "__float__")):
+            raise ScenarioError(f"{name} is {gains[name]!r}, but must be a number")
+    axis_gains = gain_of_each_axis(gains, axes)
+    gains = {base(name): value for name, value in gains.items()}
+    gains |= {} if axis_gains is None else {"observer_gain": axis_gains}
+    changes: dict[str, Any] = {}
+    for place, table in scenario.tuned_tables.items():
+        values = {name.removeprefix(table.prefix): value for name, value in gains.items() if name in table.gains}
+        outer, _, inner = place.partition(".")
+        if inner and values:
+            changes[f"{outer}__{inner}"] = {**parsing.to_dict(table), **values}
+        else:
+            changes |= {f"{outer}__{key}": value for key, value in values.items()}
+    if "t_f" in gains:
+        changes["loop__t_end"] = gains["t_f"] + (scenario.end - scenario.controller.t_f)
+    return replace(msgspec.structs.replace(scenario, defaulted={}), **changes)  # defaults count as stated

@@ -14,7 +14,7 @@ from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.plants.flexible_body import flexible
 from ptsmc_jax.plants.rigid_body import AttitudeState, spacecraft
 from ptsmc_jax.scenario import attitude_keys, device_tables, dispersion_tables, errors, identify_tables, tables
-from ptsmc_jax.scenario.custom_devices import SENSORS
+from ptsmc_jax.scenario.custom import SENSORS
 from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES, SIGMAS, largest_deviation
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.law_tables import LAWS, OBSERVERS

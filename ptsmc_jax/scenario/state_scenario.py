@@ -13,7 +13,7 @@ from msgspec import Meta
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.plants.integrator_chain import chain
 from ptsmc_jax.scenario import device_tables, dispersion_tables, errors, identify_tables, systems, tables
-from ptsmc_jax.scenario.custom_devices import SENSORS
+from ptsmc_jax.scenario.custom import SENSORS
 from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.law_tables import LAWS, OBSERVERS

@@ -225,7 +225,7 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
     observer: Any  # `law_tables.ObserverTable`
     loop: Loop
     hardware: Any = None  # `device_tables.Actuators`
-    sensors: Any = None  # `custom_devices.SensorTable` or `sensor_tables.SensorSuite`
+    sensors: Any = None  # `custom.SensorTable` or `sensor_tables.SensorSuite`
     dispersion: Any = None
     requirements: dict[str, float | Limit] = {}  # noqa: RUF012
     tune: Tune | None = None

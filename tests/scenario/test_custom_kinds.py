@@ -359,7 +359,7 @@ BAD = [
     (LAW, {"code": "mine"}, 'controller.code is "mine"', "FILE.py:NAME"),
     (LAW, {"code": None}, "controller.code is absent", "FILE.py:NAME"),
     (REMEMBERS, {}, "acceleration returns (real(1,), real(1,))", "a sliding variable, its memory"),
-    (REMEMBERS.replace("wanted, s", "wanted, s, jnp.zeros(2)"), {}, "returns (real(1,), real(1,), real(2,))", "real(1,))"),
+    (REMEMBERS.replace("wanted, s", "wanted, s, jnp.zeros(2)"), {}, "returns (real(1,), real(1,), real(2,))", "1,))"),
 ]
 # fmt: on
 

@@ -12,8 +12,8 @@ from ptsmc_jax.scenario import disturbance_tables, keys, mission
 from ptsmc_jax.scenario.device_tables import COMMAND_FILTERS, FILTERS
 from ptsmc_jax.scenario.law_tables import LAWS, common_keys
 from ptsmc_jax.scenario.layouts import SCENARIOS
+from ptsmc_jax.scenario.reading import in_scenario as in_scenario
 from ptsmc_jax.scenario.tables import Scenario
-from ptsmc_jax.scenario.tuned import in_scenario as in_scenario
 from ptsmc_jax.simulation.gains import AXIS
 from ptsmc_jax.simulation.gains import base as base
 from ptsmc_jax.simulation.gains import gains_of as gains_of
