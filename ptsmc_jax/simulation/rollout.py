@@ -8,49 +8,31 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from ptsmc_jax import programs
 from ptsmc_jax.devices.ticks import Ticks
-from ptsmc_jax.numerics import guards
+from ptsmc_jax.laws.base import Sample
+from ptsmc_jax.numerics import guards, integrators, matrices, stacking
 from ptsmc_jax.numerics.draws import WholeNumber, check_fits
 from ptsmc_jax.numerics.pytrees import Scalar
-from ptsmc_jax.simulation import continuous, sampled
+from ptsmc_jax.simulation import run_state
 from ptsmc_jax.simulation.assembly import Parts, check_parts
-from ptsmc_jax.simulation.computer import PYTHON_SOFTWARE, Software
-from ptsmc_jax.simulation.interval import Criteria
-from ptsmc_jax.simulation.run_state import (
-    DIVERGED,
-    FINISHED,
-    INCOMPLETE,
-    NOT_CONVERGED,
-    OK,
-    SINGULAR,
-    SINGULAR_DISTANCE,
-    STATUS,
-    TOO_FAST,
-    UNBOUNDED,
-    Log,
-    Result,
-    Run,
-)  # fmt: skip
-
-__all__ = [
-    "DIVERGED",
-    "FINISHED",
-    "INCOMPLETE",
-    "NOT_CONVERGED",
-    "OK",
-    "SINGULAR",
-    "SINGULAR_DISTANCE",
-    "STATUS",
-    "TOO_FAST",
-    "UNBOUNDED",
-    "Log",
-    "Parts",
-    "Result",
-    "simulate",
-    "simulate_parts",
-]  # fmt: skip
+from ptsmc_jax.simulation.clock import Graded
+from ptsmc_jax.simulation.computer import PYTHON_SOFTWARE, Computer, Decision, Software
+from ptsmc_jax.simulation.control_period import Record, State, Tick, control_period, schedule, start
+from ptsmc_jax.simulation.interval import Criteria, Torques
+from ptsmc_jax.simulation.run_state import DIVERGED as DIVERGED
+from ptsmc_jax.simulation.run_state import FINISHED as FINISHED
+from ptsmc_jax.simulation.run_state import INCOMPLETE as INCOMPLETE
+from ptsmc_jax.simulation.run_state import NOT_CONVERGED as NOT_CONVERGED
+from ptsmc_jax.simulation.run_state import OK as OK
+from ptsmc_jax.simulation.run_state import SINGULAR as SINGULAR
+from ptsmc_jax.simulation.run_state import SINGULAR_DISTANCE as SINGULAR_DISTANCE
+from ptsmc_jax.simulation.run_state import STATUS as STATUS
+from ptsmc_jax.simulation.run_state import TOO_FAST as TOO_FAST
+from ptsmc_jax.simulation.run_state import UNBOUNDED as UNBOUNDED
+from ptsmc_jax.simulation.run_state import Log, Result, Run, Score
 
 
 def simulate(
@@ -84,9 +66,103 @@ def simulate(
     x0 = jax.tree.map(lambda v: jnp.asarray(v, float), parts.aligned_initial)
     unit = parts.controller.kinematics.singularity_distance_unit(parts.controller.singularity_distance(x0, target))
     target_t_f = parts.reference(criteria.t_f)
-    unit, uncovered_from = jax.lax.stop_gradient(unit), _first_uncovered_time(parts, ticks)
+    unit, uncovered_from = jax.lax.stop_gradient(unit), _first_time_without_samples(ticks, parts.t_end)
+    if isinstance(parts.clock, Graded):
+        is_too_coarse = parts.clock.is_too_coarse(parts.controller.t_f, parts.controller.delta)
+        uncovered_from = jnp.where(is_too_coarse, 0.0, uncovered_from)
     run = Run(parts, ticks, criteria, x0, target, target_t_f, unit, uncovered_from, record)
-    return sampled.simulate(run, seed, trial, software) if parts.clock.sampled else continuous.simulate(run)
+    return _simulate_sampled(run, seed, trial, software) if parts.clock.sampled else _simulate_continuous(run)
+
+
+def _simulate_sampled(run: Run, seed: WholeNumber, trial: WholeNumber, software: Software) -> Result:
+    """Return the result of a sampled run: control periods one after the other, with metrics and history."""
+    ticks = _append_end_sample(run.ticks, run.criteria.t_end) if run.record else run.ticks
+    vehicle, state = start(run.parts, ticks, run.x0, seed, trial, software)
+
+    def step(carry: tuple[State, Score], tick: Tick) -> tuple[tuple[State, Score], Log | None]:
+        state, score = carry
+        after, record = control_period(vehicle, state, tick)
+        measured_tick = None if software.on_processor else tick
+        row = run_state.history_row(run, state, after, record, measured_tick) if run.record else None
+        return (after, run_state.advance(run, score, state, after, record)), row
+
+    first = run_state.begin(run)
+    (state, score), rows = stacking.scan(step, (state, first), schedule(ticks))
+    log = None
+    if rows is not None:
+        log = run_state.history(jax.tree.map(lambda v: v[:-1], rows), _last_row(run, state, rows))
+    return run_state.finish(run, first, score, log, software.count_statuses(state.computer))
+
+
+def _last_row(run: Run, state: State, rows: Log) -> Log:
+    """Return the row at t_end: the estimate and s of a sample there, and the torque held until then."""
+    parts, t, x, torque = run.parts, run.criteria.t_end, state.x, state.torque
+    end_index = jnp.argmax(rows.t >= t)
+    d_hat, s = rows.d_hat[end_index], rows.s[end_index]
+    decision = Decision(parts.reference(t), d_hat, torque, s)
+    wheels = None if state.actuators.h is None else (state.actuators.h, state.actuators.v)
+    last = run_state.history_row_at(run, t, x, decision, torque, jnp.asarray(True), state.walk, wheels)
+    readings, sent = jax.tree.map(lambda column: column[end_index], (rows.readings, rows.sent))
+    return last._replace(readings=readings, sent=sent)
+
+
+def _append_end_sample(ticks: Ticks, t_end: Scalar) -> Ticks:
+    """Append a sample at t_end, whose period has no length and changes no metric."""
+    end_sample = Ticks(t_end, t_end, jnp.asarray(True), ticks.sample[-1] + 1, jnp.ones_like(t_end), jnp.asarray(False))
+    return jax.tree.map(lambda column, value: jnp.append(column, value.astype(column.dtype)), ticks, end_sample)
+
+
+def _simulate_continuous(run: Run) -> Result:
+    """Return the result of a continuous run.
+
+    Law and observer are integrated with the plant. The observer's linear part is exact (ETDRK4).
+    """
+    parts, ticks, controller = run.parts, run.ticks, run.parts.controller
+    observer = parts.observer
+    model = observer.model
+    k2 = observer.error_bound()
+    lengths = ticks.t_next - ticks.t
+    decay_matrices = jax.vmap(observer.decay_matrix)(ticks.t, ticks.t_next)
+    largest_decay = jnp.max(jax.vmap(lambda a, dt: matrices.row_norm(a) * dt)(decay_matrices, lengths))
+    decays = jax.vmap(lambda a, dt: integrators.decay(a, dt, largest_decay))(decay_matrices, lengths)
+
+    def step(carry: tuple[State, Score], tick: tuple) -> tuple[tuple[State, Score], Log | None]:
+        (now, decay), (state, score) = tick, carry
+        x, memory = state.x, state.computer.observer
+        dt, target = now.t_next - now.t, parts.reference(now.t)
+
+        def rate(t: Scalar, x: Any, memory: Array) -> tuple[Any, Array, tuple[Array, Array]]:
+            sample = Sample(t, now.hold, dt)
+            u, s, _ = controller(sample, x, parts.reference(t), observer.estimate(memory), k2(t))
+            x_dot = parts.plant.rate(t, x, u, parts.disturbance(t, x))
+            d_eff = model.implied_disturbance(t, x, x_dot, u)
+            return x_dot, observer.forcing(t, (now.t, now.t_next), memory, d_eff), (u, s)
+
+        x_next, memory_next, (u, s) = integrators.etdrk4(rate, decay, now.t, x, memory, dt)
+        x_next = parts.plant.normalise(x_next)
+        _, _, (u_end, _) = rate(now.t_next, x_next, memory_next)
+        u_nodes = u, u_end  # without the middle stage, whose torque oscillates from step to step in a thin layer
+        torques = Torques(u_nodes, u_nodes, (1 / 2, 1 / 2), jnp.asarray(False), None)
+        decision = Decision(target, observer.estimate(memory), u, s)
+        record = Record(now, decision, torques, lambda t: x_next, dt)
+        torque = jnp.where(now.t_next > now.t, u_end, state.torque)
+        after = State(x_next, torque, state.computer._replace(observer=memory_next))
+        row = run_state.history_row(run, state, after, record) if run.record else None
+        return (after, run_state.advance(run, score, state, after, record)), row
+
+    first = run_state.begin(run)
+    start_state = State(run.x0, jnp.zeros(parts.plant.inputs), Computer(None, None, observer.begin(), None, None))
+    (state, score), rows = stacking.scan(step, (start_state, first), (ticks, decays))
+    log = None
+    if rows is not None:
+        t = run.criteria.t_end
+        x, d_hat = state.x, observer.estimate(state.computer.observer)
+        target, hold = parts.reference(t), t >= controller.hand_over
+        u, s, _ = controller(Sample(t, hold, jnp.zeros_like(t)), x, target, d_hat, k2(t))
+        decision = Decision(target, d_hat, u, s)
+        last = run_state.history_row_at(run, t, x, decision, u, jnp.asarray(True))
+        log = run_state.history(rows, last)
+    return run_state.finish(run, first, score, log)
 
 
 def _check_fit(parts: Parts) -> None:
@@ -136,15 +212,6 @@ def _first_time_without_samples(ticks: Ticks, t_end: Scalar) -> Scalar:
     first, last = ticks.t[0], ticks.t_next[-1]
     end_of_samples = jnp.where(last < t_end - guards.time_tolerance(t_end, t_end), last, jnp.nan)
     return jax.lax.stop_gradient(jnp.where(first > 0.0, 0.0, end_of_samples))
-
-
-def _first_uncovered_time(parts: Parts, ticks: Ticks) -> Scalar:
-    """Return the first time that the clock does not cover [s], or NaN; 0 if continuous steps are too coarse."""
-    clock: Any = parts.clock
-    without_samples = _first_time_without_samples(ticks, parts.t_end)
-    if clock.sampled:
-        return without_samples
-    return jnp.where(clock.is_too_coarse(parts.controller.t_f, parts.controller.delta), 0.0, without_samples)
 
 
 class _SimulateProgram(programs.Program):

@@ -13,7 +13,7 @@ from ptsmc_jax.laws.kinematics import MultiplicativeKinematics
 from ptsmc_jax.observers import nonlinear
 from ptsmc_jax.plants import integrator_chain, rigid_body, second_order
 from ptsmc_jax.signals import disturbances, references
-from ptsmc_jax.simulation import clock, control_period, rollout, sampled
+from ptsmc_jax.simulation import clock, control_period, rollout
 from ptsmc_jax.simulation.gains import with_gains
 from tests.helpers import (
     FULL_INERTIA,
@@ -271,13 +271,13 @@ def test_either_sign_of_the_quaternion_is_the_same_run():
 
 
 def test_other_numbers_use_the_same_compiled_program(monkeypatch):
-    traced, loop = [], sampled.simulate
+    traced, loop = [], rollout._simulate_sampled
 
     def counted(*args):
         traced.append(args)
         return loop(*args)
 
-    monkeypatch.setattr(sampled, "simulate", counted)
+    monkeypatch.setattr(rollout, "_simulate_sampled", counted)
     for k in range(3):
         run = parts(20.0 - k, 3.0 + k, 0.5 + k, 10.0 * (1 + k), k1=1.0 + k, period=0.25, noise=(1e-5 * k, 1e-6))
         run = replace(run, clock=replace(TIGHT, period=vector(0.25 + 0.01 * k), t_end=vector(30.0 - k)))
