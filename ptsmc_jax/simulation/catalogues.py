@@ -1,12 +1,18 @@
 """The metrics and margins by name, with unit and meaning. `[requirements]` may limit each of them.
 
-The metrics are in `metric_table`; the pointing error indices are added here. This module does not import JAX.
+The functions that compute them are in `metrics` and `pointing`.
 """
 
 import math
 from typing import NamedTuple
 
-from ptsmc_jax.simulation.metric_table import METRICS
+from ptsmc_jax.simulation import pointing
+from ptsmc_jax.simulation.metrics import METRICS
+from ptsmc_jax.simulation.pointing import AXES as AXES
+from ptsmc_jax.simulation.pointing import INDICES as INDICES
+from ptsmc_jax.simulation.pointing import RELATIVE_INDICES as RELATIVE_INDICES
+from ptsmc_jax.simulation.pointing import TIME_FRACTION_METRICS as TIME_FRACTION_METRICS
+from ptsmc_jax.simulation.pointing import WITHIN as WITHIN
 
 
 class Entry(NamedTuple):
@@ -17,38 +23,14 @@ class Entry(NamedTuple):
     table: str | None = None  # only runs with this table in the scenario have the metric; None: all runs
 
 
-# pointing error indices (ECSS-E-ST-60-10C), see `pointing`; each metric is the largest value in the observation
-INDICES = {
-    "ape": "APE, the error",
-    "mpe": "MPE, the error's mean over a window",
-    "rpe": "RPE, the error less its window's mean",
-    "pde": "PDE, the difference of the means of two windows",
-    "ake": "AKE, the error of the attitude that the law is given",
-    "mke": "MKE, the mean over a window of the error of the attitude that the law is given",
-    "rke": "RKE, the error of the attitude that the law is given less its window's mean",
-}
-AXES = {"x": "about x", "y": "about y", "z": "about z", "boresight": "half-cone of the boresight"}
-# indices that a requirement may limit in a fraction of the time
-TIME_FRACTION_INDICES = ("ape", "mpe", "rpe", "ake", "mke", "rke")
-RELATIVE_INDICES = ("rpe", "rke")  # errors relative to the mean of their window, whose samples must be stored
-TIME_FRACTION_METRICS = tuple(f"{index}_{axis}" for index in TIME_FRACTION_INDICES for axis in AXES)
-WITHIN = "within_"  # within_NAME is the fraction of the time in which the metric NAME is within its limit
 # prefixes of the knowledge errors, which are metrics of runs with measurement noise only
 KNOWLEDGE = tuple(f"{prefix}{index}" for prefix in ("", WITHIN) for index in ("ake", "mke", "rke"))
 
 CATALOGUE = {
     **{name: Entry(metric.unit, metric.meaning, metric.table) for name, metric in METRICS.items()},
-    **{
-        f"{index}_{axis}": Entry("rad", f"{meaning}, {axis_meaning}: largest in the observation", "pointing")
-        for index, meaning in INDICES.items()
-        for axis, axis_meaning in AXES.items()
-    },
-    **{
-        f"{WITHIN}{name}": Entry("-", f"fraction of the observation in which {name} is within its limit", "pointing")
-        for name in TIME_FRACTION_METRICS
-    },
+    **{name: Entry(*entry, "pointing") for name, entry in pointing.METRICS.items()},
 }
-POINTING = tuple(name for name, entry in CATALOGUE.items() if entry.table == "pointing")
+POINTING = tuple(pointing.METRICS)
 # metrics of other plants, whose x_1 is the error, in the units of their states and inputs
 STATE_CATALOGUE = {name: Entry(*metric.of_states) for name, metric in METRICS.items() if metric.of_states is not None}
 MAY_BE_ZERO = ("saturated",)  # metrics that a requirement may limit to zero

@@ -18,7 +18,7 @@ from ptsmc_jax.numerics.pytrees import Scalar
 from ptsmc_jax.observers.base import Bound
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.computer import PYTHON_SOFTWARE, Computer, Decision, Period, Software
-from ptsmc_jax.simulation.interval import Torques
+from ptsmc_jax.simulation.metrics import Torques
 
 DISTURBANCE_WALK = "disturbance_walk"
 SAMPLE_TIMES = "timing_jitter_samples"

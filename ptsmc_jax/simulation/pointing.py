@@ -9,9 +9,10 @@ An observation consists of consecutive windows of length D. The indices of an er
 
 Each metric is the largest value in the observation, about each axis and as the half-cone of the boresight. Only the
 history of the present window is stored, and only if a requirement limits the relative error for a fraction of the time.
-Start with `update`.
+Start with `update`; `update_errors` accumulates the errors of the true and of the measured attitude.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -30,6 +31,37 @@ Vector = Float[Array, "3"]
 # which is enlarged by this factor.
 DIRECTIONS = 16
 DIRECTION_ANGLES = np.pi * np.arange(DIRECTIONS) / DIRECTIONS
+
+# pointing error indices (ECSS-E-ST-60-10C), see `pointing`; each metric is the largest value in the observation
+INDICES = {
+    "ape": "APE, the error",
+    "mpe": "MPE, the error's mean over a window",
+    "rpe": "RPE, the error less its window's mean",
+    "pde": "PDE, the difference of the means of two windows",
+    "ake": "AKE, the error of the attitude that the law is given",
+    "mke": "MKE, the mean over a window of the error of the attitude that the law is given",
+    "rke": "RKE, the error of the attitude that the law is given less its window's mean",
+}
+AXES = {"x": "about x", "y": "about y", "z": "about z", "boresight": "half-cone of the boresight"}
+# indices that a requirement may limit in a fraction of the time
+TIME_FRACTION_INDICES = ("ape", "mpe", "rpe", "ake", "mke", "rke")
+RELATIVE_INDICES = ("rpe", "rke")  # errors relative to the mean of their window, whose samples must be stored
+TIME_FRACTION_METRICS = tuple(f"{index}_{axis}" for index in TIME_FRACTION_INDICES for axis in AXES)
+WITHIN = "within_"  # within_NAME is the fraction of the time in which the metric NAME is within its limit
+# name: (unit, meaning)
+METRICS = {
+    **{
+        f"{index}_{axis}": ("rad", f"{meaning}, {axis_meaning}: largest in the observation")
+        for index, meaning in INDICES.items()
+        for axis, axis_meaning in AXES.items()
+    },
+    **{
+        f"{WITHIN}{name}": ("-", f"fraction of the observation in which {name} is within its limit")
+        for name in TIME_FRACTION_METRICS
+    },
+}
+# absolute, mean and relative error of the true attitude, and of the measured attitude
+ATTITUDE, KNOWLEDGE = ("ape", "mpe", "rpe"), ("ake", "mke", "rke")
 
 
 @pytree
@@ -333,3 +365,94 @@ def _fraction_beyond(start: Array, end: Array, limits: Array) -> Array:
     is_crossing = is_within != is_within_next
     change = jnp.where(is_crossing, jnp.abs(start - end), 1.0)
     return jnp.where(is_crossing, (jnp.maximum(start, end) - limits) / change, without_crossing)
+
+
+class PointingErrors(NamedTuple):
+    """Accumulators of the pointing error indices."""
+
+    attitude: Tally  # error of the true attitude
+    knowledge: Tally | None  # error of the attitude that the law gets; None: the law gets the true attitude
+
+
+def begin_errors(observation: Pointing, zero: Scalar, *, measured: bool) -> PointingErrors:
+    """Return the accumulators at t = 0.
+
+    Args:
+        observation: the observation.
+        zero: a zero with the type of the numbers of the run.
+        measured: whether the law gets a measured attitude.
+    """
+    knowledge = begin(zero, observation.segment_count(KNOWLEDGE[2])) if measured else None
+    return PointingErrors(begin(zero, observation.segment_count(ATTITUDE[2])), knowledge)
+
+
+def update_errors(
+    errors: PointingErrors,
+    observation: Pointing,
+    t_f: Scalar,
+    span: tuple[Scalar, Scalar],
+    attitude_error: Callable[[], ErrorPath],
+    knowledge_error: Callable[[], ConstantPath] | None,
+) -> PointingErrors:
+    """Return the accumulators after an interval that ends at t_f or later.
+
+    Args:
+        errors: accumulators before the interval.
+        observation: the observation.
+        t_f: prescribed time [s].
+        span: start and end of the interval [s].
+        attitude_error: function that returns the error of the true attitude over the interval.
+        knowledge_error: function that returns the error of the measured attitude; None without sensors.
+    """
+    observation_start = t_f + observation.after
+
+    def update_tally(tally: Tally, path: ErrorPath | ConstantPath, names: tuple[str, ...]) -> Tally:
+        # the limit of each index about each axis and of the half-cone, (indices, 4) [rad]; infinite: no limit
+        limits = [[jnp.asarray(observation.limits.get(f"{name}_{axis}", jnp.inf)) for axis in AXES] for name in names]
+        table = jnp.stack([jnp.stack(axis_limits) for axis_limits in limits])
+        return update(tally, path, *span, observation_start, observation.window, table)
+
+    attitude, knowledge = update_tally(errors.attitude, attitude_error(), ATTITUDE), errors.knowledge
+    if knowledge is not None and knowledge_error is not None:
+        knowledge = update_tally(knowledge, knowledge_error(), KNOWLEDGE)
+    return PointingErrors(attitude, knowledge)
+
+
+def metric_values(errors: PointingErrors, observation: Pointing, length: Array) -> dict[str, Array]:
+    """Return the pointing metrics by name, for an observation of a length [s]."""
+    indices = _index_values(errors.attitude, ATTITUDE, observation, length) | {"pde": drift(errors.attitude)}
+    if errors.knowledge is not None:
+        indices |= _index_values(errors.knowledge, KNOWLEDGE, observation, length)
+    return {f"{name}_{axis}": sizes[k] for name, sizes in indices.items() for k, axis in enumerate(AXES)}
+
+
+def _index_values(tally: Tally, names: tuple[str, str, str], observation: Pointing, length: Array) -> dict[str, Array]:
+    """Return the values of each index, (4,) [rad], and the fractions of the time within limits, (4,) [-].
+
+    Args:
+        tally: accumulator of one error.
+        names: names of its absolute, mean and relative index.
+        observation: the observation.
+        length: length of the observation [s].
+    """
+    absolute, mean, relative = names
+    time_in_windows = tally.windows * observation.window
+    has_window = time_in_windows > 0.0
+
+    def fraction_in_windows(beyond: Array) -> Array:
+        return jnp.where(has_window, _fraction_within(beyond, jnp.where(has_window, time_in_windows, 1.0)), jnp.nan)
+
+    return {
+        absolute: tally.largest,
+        mean: tally.mean,
+        relative: tally.relative,
+        f"{WITHIN}{absolute}": _fraction_within(tally.beyond, length),
+        f"{WITHIN}{mean}": fraction_in_windows(tally.means_beyond),
+        f"{WITHIN}{relative}": fraction_in_windows(tally.relative_beyond),
+    }
+
+
+def _fraction_within(beyond: Array, total: Array) -> Array:
+    """Return the fraction of a total time [s] that is within limits. Rounding may make `beyond` exceed the total."""
+    within = total - beyond
+    return jnp.where(within <= guards.time_tolerance(total, total), 0.0, within / total)

@@ -21,7 +21,7 @@ from ptsmc_jax.simulation.assembly import Parts, check_parts
 from ptsmc_jax.simulation.clock import Graded
 from ptsmc_jax.simulation.computer import PYTHON_SOFTWARE, Computer, Decision, Software
 from ptsmc_jax.simulation.control_period import Record, State, Tick, control_period, schedule, start
-from ptsmc_jax.simulation.interval import Criteria, Torques
+from ptsmc_jax.simulation.metrics import Criteria, Torques
 from ptsmc_jax.simulation.run_state import DIVERGED as DIVERGED
 from ptsmc_jax.simulation.run_state import FINISHED as FINISHED
 from ptsmc_jax.simulation.run_state import INCOMPLETE as INCOMPLETE

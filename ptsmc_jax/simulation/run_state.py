@@ -14,7 +14,7 @@ from ptsmc_jax.simulation import metrics, pointing
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.computer import Decision
 from ptsmc_jax.simulation.control_period import Record, State, Tick
-from ptsmc_jax.simulation.interval import Arrival, Criteria, Errors, Interval, Snapshot, Start
+from ptsmc_jax.simulation.metrics import Arrival, Criteria, Errors, Interval, Snapshot, Start
 
 OK, DIVERGED, TOO_FAST, SINGULAR, NOT_CONVERGED, UNBOUNDED, INCOMPLETE = range(7)
 # code: (status, reason)

@@ -37,7 +37,7 @@ from ptsmc_jax.devices.sensors import MeasurementModel
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.numerics import integrators, stacking
 from ptsmc_jax.simulation.control_period import PeriodMotion, star_state
-from ptsmc_jax.simulation.interval import Criteria, integral_in_window
+from ptsmc_jax.simulation.metrics import Criteria, integral_in_window
 from ptsmc_jax.simulation.rollout import Log, Parts
 
 UNKNOWN = 1e5  # Initial 1 sigma of an unknown state, relative to 1 sigma of its sensor: the first sample outweighs it.

@@ -13,7 +13,7 @@ from ptsmc_jax.numerics import attitude
 from ptsmc_jax.plants.rigid_body import AttitudeState
 from ptsmc_jax.signals import disturbances, references
 from ptsmc_jax.simulation import metrics
-from ptsmc_jax.simulation.interval import (
+from ptsmc_jax.simulation.metrics import (
     Arrival,
     Criteria,
     Errors,

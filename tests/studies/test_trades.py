@@ -12,8 +12,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import catalogues
-from ptsmc_jax.simulation.metric_table import METRICS
-from ptsmc_jax.simulation.metrics import Metrics
+from ptsmc_jax.simulation.metrics import METRICS, Metrics
 from tests.helpers import SHORT_CHAIN, refused, refuses, small_search
 from tests.output.pages import checked
 from tuning.search import gains

@@ -5,9 +5,6 @@ import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from ptsmc_jax.simulation import catalogues
-from ptsmc_jax.simulation.catalogues import CATALOGUES
-
 
 def format_number(value: float | None, format_spec: str, none: str = "-") -> str:
     """Return a number in this format, or `none` for None and NaN.
@@ -100,6 +97,8 @@ def format_metric(value: float, metric: str, plant: str) -> str:
     >>> format_metric(1e-4, "ape_boresight", "spacecraft")
     '20.6 arcsec'
     """
+    from ptsmc_jax.simulation.catalogues import CATALOGUES  # imports JAX
+
     unit = CATALOGUES[plant][metric].unit
     return format_angle(value) if unit == "rad" else f"{value:.3g} {unit}".rstrip(" -")
 
@@ -112,6 +111,8 @@ def add_unit(name: str, plant: str) -> str:
     >>> add_unit("initial_angle", "spacecraft"), add_unit("initial_angle", "chain")
     ('initial_angle [rad]', 'initial_angle [x1]')
     """
+    from ptsmc_jax.simulation import catalogues  # imports JAX
+
     units = catalogues.units(plant)
     start = "rad" if plant == "spacecraft" else units["window_error"]  # of other plants the column has |x_1|
     units |= {"torque": units["peak_torque"], "delay_margin": "s", "initial_angle": start}

@@ -6,8 +6,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ptsmc_jax.simulation import catalogues
-from ptsmc_jax.simulation.catalogues import percent
 from tuning.output.formats import add_unit
 from tuning.output.report import Table
 
@@ -44,6 +42,7 @@ def explanation_lines(inputs: list[dict[str, Any]], plant: str) -> Iterator[str]
         plant: kind of the plant.
     """
     from ptsmc_jax.numerics import statistics
+    from ptsmc_jax.simulation import catalogues  # imports JAX
 
     for (metric, trial), group in itertools.groupby(inputs, lambda row: (row["metric"], row["trial"])):
         rows = list(group)
@@ -67,6 +66,8 @@ def explanation_lines(inputs: list[dict[str, Any]], plant: str) -> Iterator[str]
 
 def _describe_percentile(row: dict[str, Any]) -> str:
     """Return the percentile of an input among all trials."""
+    from ptsmc_jax.simulation.catalogues import percent  # imports JAX
+
     if row["fraction"] is not None:
         return f"as in {percent(row['fraction'])} % of the trials"
     return f"at {row['percentile']:.1f} % (median {row['median']:.3g})"
