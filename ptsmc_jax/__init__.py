@@ -23,9 +23,8 @@ _NAMES = {
     "laws.base": "AccelerationLaw",
     "laws.kinematics": "AdditiveKinematics ChainKinematics MultiplicativeKinematics SecondOrderKinematics",
     "laws.prescribed_time": "PrescribedTime PrescribedTimeChain",
-    "observers.base": "SampledObserver",
+    "observers.base": "NoObserver SampledObserver",
     "observers.finite_time": "FiniteTimeObserver",
-    "observers.none": "NoObserver",
     "observers.nonlinear": "NonlinearObserver",
     "observers.prescribed_time": "PrescribedTimeObserver",
     "onboard.folder": "export",
@@ -70,9 +69,9 @@ if TYPE_CHECKING:
     from ptsmc_jax.laws.kinematics import SecondOrderKinematics as SecondOrderKinematics
     from ptsmc_jax.laws.prescribed_time import PrescribedTime as PrescribedTime
     from ptsmc_jax.laws.prescribed_time import PrescribedTimeChain as PrescribedTimeChain
+    from ptsmc_jax.observers.base import NoObserver as NoObserver
     from ptsmc_jax.observers.base import SampledObserver as SampledObserver
     from ptsmc_jax.observers.finite_time import FiniteTimeObserver as FiniteTimeObserver
-    from ptsmc_jax.observers.none import NoObserver as NoObserver
     from ptsmc_jax.observers.nonlinear import NonlinearObserver as NonlinearObserver
     from ptsmc_jax.observers.prescribed_time import PrescribedTimeObserver as PrescribedTimeObserver
     from ptsmc_jax.onboard.folder import export as export

@@ -24,7 +24,8 @@ from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.laws.base import Sample
 from ptsmc_jax.laws.kinematics import AdditiveKinematics, ChainKinematics
 from ptsmc_jax.laws.prescribed_time import PrescribedTime, PrescribedTimeChain
-from ptsmc_jax.observers import none, nonlinear
+from ptsmc_jax.observers import nonlinear
+from ptsmc_jax.observers.base import NoObserver
 from ptsmc_jax.plants import integrator_chain, rigid_body
 from ptsmc_jax.signals import disturbances, references
 from ptsmc_jax.simulation import clock, rollout
@@ -254,7 +255,7 @@ def chain_parts(
         disturbance=disturbance or disturbances.Constant(jnp.zeros(1)),
         reference=references.Origin(),
         controller=law,
-        observer=observer or none.NoObserver(model, vector(bound)),
+        observer=observer or NoObserver(model, vector(bound)),
         sensors=sensors.PerfectSensors() if noise is None else sensors.StateSensor(vector(noise)),
         clock=timing,
         initial=vector(x0),

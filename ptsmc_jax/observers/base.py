@@ -1,9 +1,10 @@
 """Base classes of the disturbance observers (Remark 2), and the bound K2 on their estimation error.
 
-Read `Observer` first; custom observers derive from `SampledObserver`. An observer estimates d in M w' = f(t, x, u) + d
-(see `plants.base.Plant`). The measured disturbance d_eff = M w' - f of the design model includes model errors. Every
-observer has two forms with a memory m that begins with d_hat. The continuous form is m' = -A m + forcing, where the
-simulation integrates A exactly. The digital form updates m once in each control period from the integral of d_eff.
+Read `Observer` first. Custom observers derive from `SampledObserver`, and `NoObserver` is the law without an observer.
+An observer estimates d in M w' = f(t, x, u) + d (see `plants.base.Plant`). The measured disturbance d_eff = M w' - f of
+the design model includes model errors. Every observer has two forms with a memory m that begins with d_hat. The
+continuous form is m' = -A m + forcing, where the simulation integrates A exactly. The digital form updates m once in
+each control period from the integral of d_eff.
 """
 
 from abc import ABC, abstractmethod
@@ -14,8 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ptsmc_jax import declare
-from ptsmc_jax.numerics import integrators, matrices
-from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
 from ptsmc_jax.plants.base import Plant
 
 Memory = Float[Array, " memory"]
@@ -151,43 +151,32 @@ class SampledObserver(Observer):
         return self.step(memory, impulse / length, t, length)
 
 
+@pytree
 @dataclass(frozen=True)
-class LinearObserver(Observer):
-    """Base of the observers with a constant gain l = diag(gain)."""
+class NoObserver(Observer):
+    """No observer: d_hat = 0, and the switching gain K must exceed the whole disturbance.
 
-    gain: Leaf = declare.gain(  # (m,), so that l J^-1 is in 1/s
-        None, "dead_beat", each=True, unit=("N m s", "1/s"),
-        meaning="diagonal of l(w), or of its constant part; 10 in the paper; default for the sampled "
-                "loop: as fast as the hold phase",
-    )  # fmt: skip
-    disturbance_rate_bound: Leaf  # pyright: ignore[reportGeneralTypeIssues]  # c of Assumption 1, bound on each component of d' [N m/s]
-    initial_error: Leaf  # pyright: ignore[reportGeneralTypeIssues]  # bound on |d_hat(0) - d(0)| [N m]; (57) needs it, but the paper has no value
+    Laws (10), (29) and (40) of the paper have no observer. K of Assumption 1 bounds each component of d. The law uses a
+    bound on the 2-norm, so K2 = sqrt(m) K.
+    """
+
+    disturbance_bound: Leaf  # K of Assumption 1, bound on each component of d [N m]
+    estimates: ClassVar[bool] = False
     linear: ClassVar[bool] = True
 
+    def error_bound(self) -> ErrorBound:
+        """Return sqrt(m) K at all times."""
+        return constant_bound(self.disturbance_bound, self.model.inputs)
+
     def decay_matrix(self, t: Scalar, t_next: Scalar) -> Matrix:
-        """Return A = l J^-1 [1/s], which is constant over the step."""
-        return self._constant_decay()
+        return jnp.zeros((self.model.inputs, self.model.inputs))
 
-    def _constant_decay(self) -> Matrix:
-        """Return the constant part l J^-1 of A [1/s]."""
-        return self.gain[:, None] * self.model.inertia_inverse
-
-    def _linear_bound(self) -> ErrorBound:
-        """Return the bound K2(t) by the corrected form of (55).
-
-        (55) needs sqrt(m) c instead of c, because c bounds each component of d' and K2 bounds the 2-norm of the error.
-        l_m is the smallest eigenvalue of l^1/2 J^-1 l^1/2, and the bound has the factor sqrt(cond(l)). For a diagonal J
-        and equal gains, l_m is the smallest diagonal element of l J^-1, as in the paper, and the factor is 1.
-        """
-        root = jnp.sqrt(self.gain)
-        scaled = root[:, None] * self.model.inertia_inverse * root[None, :]
-        slowest = matrices.smallest_eigenvalue(scaled)
-        factor = jnp.sqrt(jnp.max(self.gain) / jnp.min(self.gain))
-        floor = factor * jnp.sqrt(float(self.model.inputs)) * self.disturbance_rate_bound / slowest
-        return ErrorBound(slowest, factor * self.initial_error, floor)
+    def forcing(self, t: Scalar, span: tuple[Scalar, Scalar], memory: Memory, d_eff: Vector) -> Memory:
+        return jnp.zeros_like(memory)
 
     def update_matrix(self, dt: Scalar) -> Matrix:
-        """Return (I - e^(-A dt)) / dt = A phi_1(-A dt) [1/s], with A = l J^-1. It is smooth in dt, also at dt = 0."""
-        a = self._constant_decay()
-        _, phi = integrators.phi_functions(-a * dt, 1)
-        return a @ phi
+        """Return zeros (m, m), which `update` does not use."""
+        return jnp.zeros((self.model.inputs, self.model.inputs))
+
+    def update(self, matrix: Matrix, memory: Memory, impulse: Vector, t: Scalar, dt: Scalar) -> Memory:
+        return memory

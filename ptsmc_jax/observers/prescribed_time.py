@@ -8,7 +8,8 @@ from jaxtyping import Array
 
 from ptsmc_jax import declare
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
-from ptsmc_jax.observers.base import ErrorBound, LinearObserver, Matrix, Memory
+from ptsmc_jax.observers.base import ErrorBound, Matrix, Memory
+from ptsmc_jax.observers.nonlinear import NonlinearObserver
 
 
 class PrescribedTimeBound(NamedTuple):
@@ -48,7 +49,7 @@ class PrescribedTimeBound(NamedTuple):
 
 @pytree
 @dataclass(frozen=True)
-class PrescribedTimeObserver(LinearObserver):
+class PrescribedTimeObserver(NonlinearObserver):
     """An observer that converges by t_o. Afterwards it is the nonlinear observer.
 
     Until T_o - delta_o it is the nonlinear observer with the gain l + mu M/(T_o - t), where l = diag(gain). The error
@@ -80,11 +81,11 @@ class PrescribedTimeObserver(LinearObserver):
         return self.mu * jnp.where(dt > 0.0, mean, 0.0)
 
     def error_bound(self) -> PrescribedTimeBound:
-        return PrescribedTimeBound(self._linear_bound(), self.mu, self.t_o, self.delta_o)
+        return PrescribedTimeBound(super().error_bound(), self.mu, self.t_o, self.delta_o)
 
     def decay_matrix(self, t: Scalar, t_next: Scalar) -> Matrix:
         """Return the mean of A = l J^-1 + mu/(T_o - t) over the step [1/s]."""
-        return self._constant_decay() + self._mean_rate(t, t_next) * jnp.eye(self.model.inputs)
+        return super().decay_matrix(t, t_next) + self._mean_rate(t, t_next) * jnp.eye(self.model.inputs)
 
     def forcing(self, t: Scalar, span: tuple[Scalar, Scalar], memory: Memory, d_eff: Vector) -> Memory:
         """Return the forcing A(t) d_eff - (A(t) - A) d_hat of d_hat' + A d_hat [N m/s]; A is the mean over the step.
@@ -94,7 +95,7 @@ class PrescribedTimeObserver(LinearObserver):
         early = 0.5 * (span[0] + span[1]) < self.t_o - self.delta_o
         rate = jnp.where(early, self.mu / self._time_left(t), 0.0)
         deviation = rate - self._mean_rate(*span)
-        return self.gain * (self.model.inertia_inverse @ d_eff) + rate * d_eff - deviation * memory
+        return super().forcing(t, span, memory, d_eff) + rate * d_eff - deviation * memory
 
     def update(self, matrix: Matrix, memory: Memory, impulse: Vector, t: Scalar, dt: Scalar) -> Memory:
         """Update as `NonlinearObserver` does, with E = e^(-l J^-1 dt) ((T_o - t)/(T_o - t + dt))^mu."""

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.dispersions.variation import Dispersion
-from ptsmc_jax.observers.none import NoObserver
+from ptsmc_jax.observers.base import NoObserver
 from ptsmc_jax.onboard import derived
 from ptsmc_jax.onboard.board import Board, Stage, Values
 from ptsmc_jax.onboard.fmu import FILTER_STATE

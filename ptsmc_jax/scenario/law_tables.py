@@ -14,7 +14,7 @@ from ptsmc_jax.declare import Scaled
 from ptsmc_jax.laws import baselines, kinematics, prescribed_time, time_base
 from ptsmc_jax.laws.base import AccelerationLaw
 from ptsmc_jax.numerics.pytrees import vector
-from ptsmc_jax.observers import base, finite_time, none, nonlinear
+from ptsmc_jax.observers import base, finite_time, nonlinear
 from ptsmc_jax.observers.prescribed_time import PrescribedTimeObserver
 from ptsmc_jax.scenario import disturbance_tables, mission
 from ptsmc_jax.scenario.custom import Custom, custom_kind
@@ -292,7 +292,7 @@ def _observer_kinds(default: str, body: bool) -> Mapping[str, type[ObserverTable
     """Return the observers by kind; default: the default kind, body: whether the plant is a spacecraft."""
     kinds = {
         "nonlinear": make_table(LinearTable, nonlinear.NonlinearObserver, "nonlinear", body),
-        "none": make_table(ObserverTable, none.NoObserver, "none"),
+        "none": make_table(ObserverTable, base.NoObserver, "none"),
         "finite_time": make_table(FiniteTimeTable, finite_time.FiniteTimeObserver, "finite_time", body),
         "prescribed_time": make_table(
             PrescribedTimeTable, PrescribedTimeObserver, "prescribed_time", body

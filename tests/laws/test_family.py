@@ -17,7 +17,7 @@ from ptsmc_jax.laws import baselines, time_base
 from ptsmc_jax.laws.base import Sample
 from ptsmc_jax.laws.kinematics import ChainKinematics, MultiplicativeKinematics, SecondOrderKinematics
 from ptsmc_jax.numerics import attitude
-from ptsmc_jax.observers import none
+from ptsmc_jax.observers.base import NoObserver
 from ptsmc_jax.plants import integrator_chain, rigid_body
 from ptsmc_jax.scenario import systems
 from ptsmc_jax.signals import disturbances, references
@@ -427,7 +427,7 @@ def test_body_at_rest_rotates_about_its_eigenaxis_by_the_quintic():
         run = helpers.parts(T_F, 3.0, DELTA, inertia=FULL_INERTIA, q=q, period=0.01, t_end=T_F + 1.0,
                             disturbance=disturbances.Constant(jnp.zeros(3)))  # fmt: skip
         timing = replace(run.clock, period=vector(period))
-        log = simulate(replace(run, controller=law, clock=timing, observer=none.NoObserver(BODY, vector(0.0))))
+        log = simulate(replace(run, controller=law, clock=timing, observer=NoObserver(BODY, vector(0.0))))
         turned = Rotation.from_quat(log.x.q).as_rotvec()
         angle = np.array([float(quintic(np.array(turn), np.array(0.0), t)[0]) for t in log.t])
         along = turned @ axis

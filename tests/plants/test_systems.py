@@ -16,7 +16,7 @@ from ptsmc_jax.campaigns import store
 from ptsmc_jax.laws.kinematics import SecondOrderKinematics
 from ptsmc_jax.laws.prescribed_time import PrescribedTime
 from ptsmc_jax.numerics import attitude
-from ptsmc_jax.observers import none
+from ptsmc_jax.observers.base import NoObserver
 from ptsmc_jax.plants import second_order
 from ptsmc_jax.plants.rigid_body import AttitudeState
 from ptsmc_jax.scenario import parsing, systems
@@ -305,7 +305,7 @@ def test_systems_from_python_and_from_files_survive_replace(tmp_path: Path):
     tables = {"plant": {"kind": "system", "system": made, "x0": [0.1, 0.0]}}
     changed = scenario.study(scenario.replace(scenario.from_tables(tables), controller__eta=4.0))
     assert changed.parts.plant is made
-    assert isinstance(changed.parts.observer, none.NoObserver)
+    assert isinstance(changed.parts.observer, NoObserver)
     (tmp_path / "my.py").write_text((ROOT / "scenarios" / "two_link_arm.py").read_text())
     (tmp_path / "my.toml").write_text('[plant]\nkind = "system"\nsystem = "my.py:arm"\nx0 = [1, 1, 0, 0]\n')
     first, other = (scenario.study(scenario.read(tmp_path / "my.toml")) for _ in range(2))

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from ptsmc_jax.observers import none
+from ptsmc_jax.observers.base import NoObserver
 from ptsmc_jax.signals import disturbances, references
 from ptsmc_jax.simulation import clock, rollout
 from ptsmc_jax.theory import envelopes, hold, rates, rules, solutions
@@ -282,7 +282,7 @@ def test_ramp_error_equals_the_simulated_error_under_a_ramp(rate):
 def test_spacecraft_without_an_observer_stays_inside_its_envelope():
     wave = disturbances.Sinusoid(*(vector([v] * 3) for v in (0.01, 0.4, 0.3, 0.0)))
     run = parts(30.0, 3.0, 0.5, disturbance=wave, sign_width=0.2)
-    blind = dataclasses.replace(run, observer=none.NoObserver(run.plant, vector(0.01)))
+    blind = dataclasses.replace(run, observer=NoObserver(run.plant, vector(0.01)))
     np.testing.assert_allclose(blind.observer.error_bound()(vector(7.0)), 0.01 * np.sqrt(3.0))
     result = fly(blind)
     log = result.log
