@@ -262,7 +262,7 @@ def _continuous_grid(
     decay_rates, frequency, order = rates.hold_rates(fastest_law), _fastest_frequency(frequencies), scenario.grid_order
 
     def steps_for(frequency: float = 0.0, layer: tuple[float, float] = (0.0, 0.0), rate: float = 0.0) -> float:
-        total = sum(clock.graded_steps(reach.t_f, reach.smallest_delta, t_end, rate, frequency, layer, order))
+        total = sum(clock.graded_steps(reach.t_f, reach.smallest_delta, t_end, rate, frequency, layer, order)[:2])
         return total if total == total else math.inf
 
     rate = max(decay_rates.values())

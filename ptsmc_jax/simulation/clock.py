@@ -212,11 +212,10 @@ def graded_clock(
         saves: further nodes [s].
         order: order of a chain, otherwise 1.
     """
-    before, after = (math.ceil(steps) for steps in graded_steps(t_f, delta, t_end, hold_rate, frequency, layer, order))
+    before, after, step_before = graded_steps(t_f, delta, t_end, hold_rate, frequency, layer, order)
     save_times = np.asarray(saves, dtype=float).reshape(-1)
-    step_before, _ = _largest_steps(t_f, hold_rate, frequency, layer, order)
-    end, window_length, largest_step = (vector(v) for v in (t_end, window, step_before))
-    return Graded(end, window_length, largest_step, vector(save_times), before, after)
+    steps = math.ceil(before), math.ceil(after)
+    return Graded(vector(t_end), vector(window), vector(step_before), vector(save_times), *steps)
 
 
 def graded_steps(
@@ -227,23 +226,17 @@ def graded_steps(
     frequency: float,
     layer: tuple[float, float],
     order: int,
-) -> tuple[float, float]:
-    """Return the number of steps of `graded_clock` before and after the hand-over, not rounded up; may be infinite."""
-    before, after = _largest_steps(t_f, hold_rate, frequency, layer, order)
+) -> tuple[float, float, float]:
+    """Return the steps of `graded_clock`, see there for the arguments.
+
+    Returns:
+        The number of steps before and after the hand-over, not rounded up and perhaps infinite, and the largest step
+        before the hand-over [s].
+    """
+    refinement = max(1, 3 * order - 4)  # ratio of the number of steps for a chain to the number for a motion of order 2
+    oscillation_step = 0.3 / max(frequency, 1e-12)
+    before = min(t_f / 200.0 / refinement, oscillation_step, 1.5 / max(layer[0], 1e-12))
+    after = min(t_f / 50.0, 0.1 / max(hold_rate, 1e-300), oscillation_step, 1.5 / max(layer[1], 1e-12))
     with np.errstate(divide="ignore"):
         uniform = float(np.divide(t_f - delta, before))
-        return 200.0 * _refinement(order) + uniform, float(np.divide(t_end - t_f + delta, after))
-
-
-def _refinement(order: int) -> int:
-    """Return the ratio of the number of steps for a chain to the number for a motion of order 2."""
-    return max(1, 3 * order - 4)
-
-
-def _largest_steps(
-    t_f: float, hold_rate: float, frequency: float, layer: tuple[float, float], order: int
-) -> tuple[float, float]:
-    """Return the largest steps before and after the hand-over [s]."""
-    oscillation_step = 0.3 / max(frequency, 1e-12)
-    before = min(t_f / 200.0 / _refinement(order), oscillation_step, 1.5 / max(layer[0], 1e-12))
-    return before, min(t_f / 50.0, 0.1 / max(hold_rate, 1e-300), oscillation_step, 1.5 / max(layer[1], 1e-12))
+        return 200.0 * refinement + uniform, float(np.divide(t_end - t_f + delta, after)), before

@@ -63,19 +63,14 @@ class Period(NamedTuple):
 SAMPLE_STATUSES = ("ok", "saturated", "missed", "singular", "input", "overflow", "other")
 
 
-def count_no_statuses(computer: Computer) -> dict[str, Array]:
-    """Return an empty count of sample statuses. Only exported code reports them."""
-    return {}
-
-
 class Software(NamedTuple):
     """The flight software of a run: `boot` and `decide` of this module, or exported C instead of them."""
 
     boot: Callable[[Parts, WholeNumber, WholeNumber, Any, Ticks], Computer]
     # arguments: parts, k2, period, memory, visible state, state at star tracker readings, state of the actuators
     decide: Callable[[Parts, Bound, Period, Computer, Any, Any, ActuatorState], tuple[Decision, Computer]]
-    # returns the number of samples of a run by their status
-    count_statuses: Callable[[Computer], dict[str, Array]] = count_no_statuses
+    # returns the number of samples of a run by their status; None: the software reports none
+    count_statuses: Callable[[Computer], dict[str, Array]] | None = None
     on_processor: bool = False  # whether it runs on the host processor only
 
 

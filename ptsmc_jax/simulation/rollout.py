@@ -91,7 +91,8 @@ def _simulate_sampled(run: Run, seed: WholeNumber, trial: WholeNumber, software:
     log = None
     if rows is not None:
         log = run_state.history(jax.tree.map(lambda v: v[:-1], rows), _last_row(run, state, rows))
-    return run_state.finish(run, first, score, log, software.count_statuses(state.computer))
+    samples = None if software.count_statuses is None else software.count_statuses(state.computer)
+    return run_state.finish(run, first, score, log, samples)
 
 
 def _last_row(run: Run, state: State, rows: Log) -> Log:
@@ -166,9 +167,8 @@ def _simulate_continuous(run: Run) -> Result:
 
 
 def _check_fit(parts: Parts) -> None:
-    """Raise TypeError if the parts do not fit together or do not have the precision of JAX."""
+    """Raise TypeError if the parts do not fit together."""
     check_parts(parts)
-    _check_precision(parts.t_end)
     for name, shape in parts.plant.state_shapes.items():
         value = getattr(parts.initial, name, None) if name else parts.initial
         _check_shape(f"initial.{name}".rstrip("."), value, [shape])
@@ -189,15 +189,6 @@ def _check_continuous(parts: Parts) -> None:
     if not parts.controller.continuous:
         law = type(parts.controller).__name__
         raise TypeError(f"the law {law} needs the sampled loop: use a sampled clock")
-
-
-def _check_precision(time: Any) -> None:
-    """Raise TypeError if the parts were built while JAX used another precision."""
-    jax_type = jnp.result_type(float)
-    if isinstance(time, jax.Array) and jnp.issubdtype(time.dtype, jnp.floating) and time.dtype != jax_type:
-        parts_bits, jax_bits = (jnp.finfo(dtype).bits for dtype in (time.dtype, jax_type))
-        message = f"the parts were built in {parts_bits}-bit precision, but JAX now uses {jax_bits}-bit"
-        raise TypeError(f"{message}; build them again with study")
 
 
 def _check_shape(name: str, value: Any, allowed: list[tuple[int, ...]]) -> None:

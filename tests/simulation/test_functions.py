@@ -129,9 +129,6 @@ REFUSED = [
     (lambda: ptsmc.simulate_parts(replace(RUN, disturbance=lambda t, x: jnp.zeros(4))),
      r"the disturbance.s value must be an array \(3,\), but is one of shape \(4,\)"),
     (lambda: ptsmc.simulate_parts(replace(RUN, disturbance=None)), r"must be a function of \(t, x\), but is None"),
-    # parts from before JAX had 64 bits
-    (lambda: ptsmc.simulate_parts(jax.tree.map(lambda leaf: leaf.astype(jnp.float32), RUN)),
-     "the parts were built in 32-bit precision, but JAX now uses 64-bit"),
     # an earlier version ran trial 0
     (lambda: ptsmc.simulate_parts(RUN, 0, trial=2**40), "trial is 1099511627776, .* a whole number below 2.32 = 4"),
     (lambda: ptsmc.simulate_parts(RUN, 2**70), "seed is 11805916207.* below 2.32"),
