@@ -1,24 +1,41 @@
 """Actuators, between the commanded torque and the body: delay, quantisation, limits, lag, reaction wheels.
 
 An effect is disabled if its field is None. A channel is a source of torque: a body axis or a wheel. The derivative of
-quantisation is taken as 1. Read `Actuators` first, then `Actuators.command`.
+quantisation is taken as 1. Read `Actuators` first, then `Actuators.command`. `wheels` builds a set of reaction wheels.
 """
 
 from dataclasses import dataclass, field, fields, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from ptsmc_jax.devices.reaction_wheels import Wheels
+from ptsmc_jax.formulas import wheel_axes
 from ptsmc_jax.numerics import attitude, guards
-from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
+from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree, vector
 
 
 def quantise(u: Array, step: Scalar) -> Array:
     """Return the nearest multiple of step [N m], (m,), with derivative 1 by u instead of 0 or infinity."""
     return u + jax.lax.stop_gradient(step * jnp.round(u / step) - u)
+
+
+@pytree
+@dataclass(frozen=True)
+class Wheels:
+    """Reaction wheels: torque A v on the body, stored momentum h' = -v, allocation by the pseudo-inverse of A.
+
+    The momentum h is absolute: spin inertia times (wheel speed + a . w). The inertia J of the body therefore excludes
+    the spin inertia of each wheel, J = J_total - sum I a a' (Hughes, Spacecraft Attitude Dynamics, 1986).
+    """
+
+    axes: Leaf  # (3, n) A: spin axes in body axes, unit columns
+    allocation: Leaf  # (n, 3) pseudo-inverse of A
+    initial: Leaf  # (n,) momentum at t = 0 [N m s]
+    torque_limit: Leaf | None = None  # limit of each wheel's torque [N m]
+    momentum_limit: Leaf | None = None  # limit of each wheel's momentum [N m s]
 
 
 class ActuatorState(NamedTuple):
@@ -303,3 +320,30 @@ class Actuators:
         v, impulse, _ = self.channel_torques(drive, dt)
         v = None if state.v is None else jnp.where(dt > 0.0, v, state.v)
         return ActuatorState(queue, v, None if drive.h is None else drive.h - self.true_torque(drive, impulse))
+
+
+def wheels(axes: Any, initial: Any = None, torque_limit: Any = None, momentum_limit: Any = None) -> Wheels:
+    """Return reaction wheels.
+
+    Args:
+        axes: spin axes (n, 3) in body axes, of any length.
+        initial: momenta at t = 0 (n,) [N m s]; default 0.
+        torque_limit: limit of each wheel [N m], or None.
+        momentum_limit: limit of each wheel [N m s], or None.
+
+    Raises:
+        ValueError: if the axes do not span all directions.
+    """
+    unit = wheel_axes(axes)
+    start = np.zeros(len(unit)) if initial is None else np.asarray(initial, dtype=float)
+    limits = (None if v is None else vector(v) for v in (torque_limit, momentum_limit))
+    return Wheels(vector(unit.T), vector(np.linalg.pinv(unit.T)), vector(start), *limits)
+
+
+def spare_allocations(device: Wheels) -> Float[Array, "n n 3"]:
+    """Return the allocation matrices (n, n, 3) without each of the wheels [-].
+
+    Entry k is the pseudo-inverse of A with column k set to 0.
+    """
+    axes, numbers = np.asarray(device.axes), np.arange(device.axes.shape[1])
+    return jnp.stack([jnp.asarray(np.linalg.pinv(axes * (numbers != k), rcond=1e-6)) for k in numbers])

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ptsmc_jax.devices.star_times import pattern
+from ptsmc_jax.devices.attitude_filter import pattern
 from ptsmc_jax.numerics import attitude, guards
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
 
@@ -35,7 +35,7 @@ class SampleTimes:
     every: int | None = field(metadata={"static": True})  # control periods between readings; None if not a whole number
     wait: int = field(metadata={"static": True})  # smallest number of control samples between a reading and its use
     split: bool = field(metadata={"static": True})  # whether some readings wait for `wait` + 1 control samples
-    # numbers of control periods and of readings after which the times repeat, see `star_times.pattern`
+    # numbers of control periods and of readings after which the times repeat, see `attitude_filter.pattern`
     pattern: tuple[int, int] = field(metadata={"static": True})
 
     @property

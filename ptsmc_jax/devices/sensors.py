@@ -17,9 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ptsmc_jax.devices.attitude_filter import AttitudeFilter, Estimate, attitude_filter
+from ptsmc_jax.devices.attitude_filter import AttitudeFilter, Estimate, attitude_filter, filter_between_samples
 from ptsmc_jax.devices.attitude_sensors import SampleTimes
-from ptsmc_jax.devices.star_times import filter_between_samples
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.numerics import attitude, draws, guards
 from ptsmc_jax.numerics.draws import WholeNumber

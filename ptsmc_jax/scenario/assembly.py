@@ -9,7 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from ptsmc_jax import configure
-from ptsmc_jax.devices import reaction_wheels
+from ptsmc_jax.devices.actuators import spare_allocations
 from ptsmc_jax.dispersions.base import INITIAL_ATTITUDE, INITIAL_RATE, INITIAL_STATE
 from ptsmc_jax.dispersions.quantities import QUANTITIES, level_name
 from ptsmc_jax.dispersions.variation import Dispersion
@@ -132,9 +132,7 @@ def build_setup(scenario: Scenario) -> Setup:
     wheels = scenario.reaction_wheels
     actuators = scenario.devices.actuators(None if wheels is None else wheels.build())
     if getattr(getattr(scenario.dispersion, "wheel_failure", None), "known", False):
-        actuators = dataclasses.replace(
-            actuators, spare_allocations=reaction_wheels.spare_allocations(actuators.wheels)
-        )
+        actuators = dataclasses.replace(actuators, spare_allocations=spare_allocations(actuators.wheels))
     command_filter = scenario.devices.command_filter
     return Setup(
         plant=plant,

@@ -16,11 +16,10 @@ from msgspec import Meta
 from ptsmc_jax import formulas
 from ptsmc_jax.devices import command_filter
 from ptsmc_jax.devices.actuators import Actuators as ActuatorsPart
-from ptsmc_jax.devices.attitude_filter import attitude_filter
+from ptsmc_jax.devices.actuators import wheels
+from ptsmc_jax.devices.attitude_filter import attitude_filter, filter_between_samples
 from ptsmc_jax.devices.attitude_sensors import sample_times
-from ptsmc_jax.devices.reaction_wheels import wheels
 from ptsmc_jax.devices.sensors import PerfectSensors, Sensors, StateSensor
-from ptsmc_jax.devices.star_times import filter_between_samples
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.scenario import errors
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
@@ -105,7 +104,7 @@ class Actuators(Table, frozen=True):
         return law.law.noise_of_s(law, *self.noise_of_error(scenario))
 
     def actuators(self, wheels: Any) -> Any:
-        """Return the actuators; `wheels`: the part of `devices.reaction_wheels`, or None."""
+        """Return the actuators; `wheels`: the part of `devices.actuators`, or None."""
         values = (self.torque_limit, self.torque_rate_limit, self.torque_lag, self.torque_step)
         limit, rate_limit, lag, step = (None if v is None else vector(v) for v in values)
         scale = None if self.actuator_scale is None else vector(self.actuator_scale)
@@ -205,7 +204,7 @@ class Hardware(Actuators, frozen=True):
                 )
 
     def actuators(self, wheels: Any) -> Any:
-        """Return the actuators; `wheels`: the part of `devices.reaction_wheels`, or None."""
+        """Return the actuators; `wheels`: the part of `devices.actuators`, or None."""
         actuators = super().actuators(wheels)
         if self.actuator_misalignment_deg is None:
             return actuators
@@ -339,7 +338,7 @@ class SteadyStateFilter(FilterTable, frozen=True):
             )
 
     def build(self, scenario: Any) -> Any:
-        """Return a filter of `devices.attitude_filter`, or of `devices.star_times` with its own sample times."""
+        """Return a filter of `devices.attitude_filter`, with its own sample times or at control samples."""
         table, period = scenario.devices, scenario.loop.period
         star, gyro, walk = table.attitude_noise or 0.0, table.gyro_noise(period), table.rate_bias_walk or 0.0
         arguments = tuple(vector(v) for v in (self.bandwidth, star, gyro, walk, period))
@@ -389,7 +388,7 @@ class WheelLimits(Table, frozen=True):
             raise wrong("wheels.momentum", self.momentum, f"within wheels.momentum_limit, {limit}")
 
     def build(self) -> Any:
-        """Return the wheels of `devices.reaction_wheels`."""
+        """Return the wheels of `devices.actuators`."""
         return wheels(self.spin_axes(), self.momentum, self.torque_limit, self.momentum_limit)
 
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from ptsmc_jax import formulas, programs, scenario
 from ptsmc_jax.campaigns import runs
-from ptsmc_jax.devices import actuators, attitude_filter, reaction_wheels, sensors
+from ptsmc_jax.devices import actuators, attitude_filter, sensors
 from ptsmc_jax.numerics import draws
 from ptsmc_jax.plants.rigid_body import AttitudeState
 from ptsmc_jax.scenario.errors import ScenarioError
@@ -81,7 +81,7 @@ def test_a_command_counts_as_limited_if_one_axis_is_out_of_reach(lag):
 @pytest.mark.parametrize("way", [1.0, -1.0])
 def test_wheels_end_a_period_at_their_momentum_limit(lag, way):
     """A torque in either direction that would exceed the limit is reduced, so that the period ends at the limit."""
-    wheels = reaction_wheels.wheels(np.eye(3), None, momentum_limit=0.5)
+    wheels = actuators.wheels(np.eye(3), None, momentum_limit=0.5)
     device = actuators.Actuators(lag=None if lag is None else vector(lag), wheels=wheels)
     v = None if lag is None else [0.3 * way] * 3
     drive, end = commanded(device, [50.0 * way] * 3, v=v, h=[0.2, -0.3, 0.0])
@@ -277,7 +277,7 @@ def with_spinning(wheels, **changes):
 
 def test_peak_wheel_momentum_includes_the_initial_momentum():
     """The wheel gives momentum to the body and takes back less, so that its momentum is largest at t = 0."""
-    spinning = reaction_wheels.wheels(np.eye(3), [5.0, 0.0, 0.0])
+    spinning = actuators.wheels(np.eye(3), [5.0, 0.0, 0.0])
     turned = {"q": Rotation.from_rotvec([-1.0, 0.0, 0.0]).as_quat(), "rate": (-0.1, 0.0, 0.0)}
     result = fly(with_spinning(spinning, **turned))
     assert np.all(np.abs(result.log.wheels[0][1:]) < 5.0)
@@ -287,11 +287,11 @@ def test_peak_wheel_momentum_includes_the_initial_momentum():
 @pytest.mark.parametrize("early", [True, False])
 def test_wheel_and_allocation_change_at_the_same_sample_on_failure(early):
     """At a sample exactly at the failure time the other wheels deliver the whole torque."""
-    device = reaction_wheels.wheels(PYRAMID)
+    device = actuators.wheels(PYRAMID)
     failing = actuators.Actuators(
         wheels=device,
         failure_times=vector([3.0, np.inf, np.inf, np.inf]),
-        spare_allocations=reaction_wheels.spare_allocations(device),
+        spare_allocations=actuators.spare_allocations(device),
     )
     at, u, one = vector(np.nextafter(3.0, 0.0) if early else 3.0), vector([0.1, -0.2, 0.3]), vector(1.0)
     drive, _ = failing.command(failing.begin(3), u, vector(np.zeros(3)), at, one, one)
@@ -304,13 +304,13 @@ def test_wheel_and_allocation_change_at_the_same_sample_on_failure(early):
 def test_allocation_gives_the_commanded_torque_for_any_geometry():
     rng = np.random.default_rng(0)
     for axes in (PYRAMID, np.eye(3), rng.normal(size=(6, 3)), 7.0 * rng.normal(size=(3, 3))):
-        found = reaction_wheels.wheels(axes)
+        found = actuators.wheels(axes)
         np.testing.assert_allclose(found.axes @ found.allocation, np.eye(3), atol=1e-12)
         np.testing.assert_allclose(np.linalg.norm(found.axes, axis=0), 1.0)
     flat = [[1, 0, 0], [0, 1, 0], [1, 1, 0]]
     for bad, said in ((flat, "span"), (flat[:2], "span"), ([1, 2, 3], "rows"), ([[0, 0, 0]] * 3, "rows")):
         with pytest.raises(ValueError, match=said):
-            reaction_wheels.wheels(bad)
+            actuators.wheels(bad)
     strength = np.abs(PYRAMID).sum(axis=0)
     np.testing.assert_allclose(strength, strength[0])  # the default cant
 
@@ -333,7 +333,7 @@ def everything(delta=0.93, **changes):
     sensing = sensors.Sensors(vector(2e-5), vector(1e-6), vector(1e-5), vector(1e-8), filtered, 2)
     device = actuators.Actuators(
         torque_limit=vector(3.0), rate_limit=vector(4.0), lag=vector(0.03), step=vector(1e-13),
-        wheels=reaction_wheels.wheels(PYRAMID, [0.1, 0.0, 0.0, 0.0], 2.0, 5.0), delay=1,
+        wheels=actuators.wheels(PYRAMID, [0.1, 0.0, 0.0, 0.0], 2.0, 5.0), delay=1,
     )  # fmt: skip
     gravity = disturbances.GravityGradient(run.plant.inertia, vector([0.0, 0.0, 0.0, 1.0]), vector(1e-3), vector(0.4))
     total = disturbances.Sum((run.disturbance, gravity))
@@ -404,7 +404,7 @@ def test_gradients_are_finite_where_functions_are_not_differentiable():
     """These points are at a limit, at rest and at the target, where clip, sign and the end of a ramp have a kink."""
     device = actuators.Actuators(
         torque_limit=vector(0.3), rate_limit=vector(0.5), lag=vector(0.1), step=vector(0.1),
-        wheels=reaction_wheels.wheels(PYRAMID, None, 0.2, 0.5), delay=1,
+        wheels=actuators.wheels(PYRAMID, None, 0.2, 0.5), delay=1,
     )  # fmt: skip
 
     def outcome(u, v, h, dt):
@@ -444,7 +444,7 @@ def test_a_saturated_slew_stays_finite_and_converges_after_t_f():
 
 @pytest.mark.parametrize("lag", short([None, 0.08], [None]))
 def test_momentum_limit_does_not_violate_the_torque_limit(lag):
-    limits = reaction_wheels.wheels(PYRAMID, [0.4, 0.0, 0.0, -0.4], torque_limit=0.1, momentum_limit=0.45)
+    limits = actuators.wheels(PYRAMID, [0.4, 0.0, 0.0, -0.4], torque_limit=0.1, momentum_limit=0.45)
     device = actuators.Actuators(lag=None if lag is None else vector(lag), wheels=limits)
     run = dataclasses.replace(with_device(device), substeps=4)
     result = fly(run, 1, 2)
@@ -456,7 +456,7 @@ def test_momentum_limit_does_not_violate_the_torque_limit(lag):
 
 def test_observer_estimates_no_disturbance_from_wheel_momentum():
     """One wheel has 20 N m s, and there is no disturbance. The observer knows w x A h at both ends of the period."""
-    spinning = reaction_wheels.wheels(np.eye(3), [20.0, 0.0, 0.0])
+    spinning = actuators.wheels(np.eye(3), [20.0, 0.0, 0.0])
     log = fly(with_spinning(spinning)).log
     # the error of the trapezium rule is h^2/12 w'' H, with w'' = 0.05 rad/s^3 at the end of the slew
     assert np.abs(log.d_hat).max() < 1e-3
@@ -465,7 +465,7 @@ def test_observer_estimates_no_disturbance_from_wheel_momentum():
 def test_wheel_momentum_compensation_has_the_delay_of_the_command():
     """The flight computer adds w x A h to the command of the same sample, so that both have the same delay."""
     momentum, rate = [0.3, -0.1, 0.2], vector([0.02, 0.05, -0.01])
-    device = actuators.Actuators(wheels=reaction_wheels.wheels(np.eye(3), momentum), delay=2)
+    device = actuators.Actuators(wheels=actuators.wheels(np.eye(3), momentum), delay=2)
     state, applied = device.begin(3), []
     for k, w in enumerate((rate, 0.0 * rate, 0.0 * rate)):
         drive, queue = device.command(state, vector([0.0] * 3), w, vector(0.1 * k), vector(0.1), vector(1.0))

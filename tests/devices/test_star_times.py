@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import runs
-from ptsmc_jax.devices import attitude_filter, attitude_sensors, sensors, star_times
+from ptsmc_jax.devices import attitude_filter, attitude_sensors, sensors
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.onboard import vectors
 from ptsmc_jax.plants import rigid_body
@@ -136,7 +136,9 @@ NOISES = {"bandwidth": 0.15, "attitude_noise": 2e-5, "rate_noise": 2e-6, "bias_w
 
 @pytest.mark.parametrize("every", [1, 4])
 def test_filter_between_equals_attitude_filter_for_an_integer_ratio(every):
-    found = star_times.filter_between_samples(*NOISES.values(), interval=0.25 * every, periods_and_samples=(every, 1))
+    found = attitude_filter.filter_between_samples(
+        *NOISES.values(), interval=0.25 * every, periods_and_samples=(every, 1)
+    )
     known = attitude_filter.attitude_filter(*NOISES.values(), every)
     for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(known), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-20)
@@ -145,7 +147,7 @@ def test_filter_between_equals_attitude_filter_for_an_integer_ratio(every):
 def test_filter_errors_have_the_steady_state_covariance_from_the_first_sample():
     """4 000 trials of a body at rest. The sample times repeat after five periods with two star tracker samples."""
     times = attitude_sensors.sample_times(0.625, 0.0, 0.25)
-    found = star_times.filter_between_samples(*NOISES.values(), times.interval, times.pattern)
+    found = attitude_filter.filter_between_samples(*NOISES.values(), times.interval, times.pattern)
     walk = NOISES["bias_walk"] / np.sqrt(NOISES["period"])
     sensor = sensors.Sensors(vector(NOISES["attitude_noise"]), vector(NOISES["rate_noise"]), vector(1e-4),
                              vector(walk), found, own_times=times)  # fmt: skip

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ptsmc_jax import formulas, scenario
 from ptsmc_jax.campaigns import runs
-from ptsmc_jax.devices import actuators, reaction_wheels
+from ptsmc_jax.devices import actuators
 from ptsmc_jax.dispersions.numbers import TRUNCATION_SIGMAS
 from ptsmc_jax.dispersions.quantities import QUANTITIES, read_columns
 from ptsmc_jax.numerics import draws, paths
@@ -125,7 +125,7 @@ def test_star_tracker_misalignment_rotates_the_final_attitude_by_its_opposite():
 
 
 def test_wheels_with_scale_and_misalignment_deliver_and_store_momentum_along_their_true_axes():
-    wheels = reaction_wheels.wheels(formulas.pyramid(), [0.5, -0.2, 0.1, 0.3])
+    wheels = actuators.wheels(formulas.pyramid(), [0.5, -0.2, 0.1, 0.3])
     turned = np.array(wheels.axes) + 0.02 * np.random.default_rng(0).normal(size=(3, 4))
     scale, command = np.array([1.1, 0.9, 1.05, 0.95]), vector([0.13, -0.2, 0.25])
     device = actuators.Actuators(wheels=wheels, scale=vector(scale), directions=vector(turned))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from ptsmc_jax.devices import actuators, attitude_filter, attitude_sensors, reaction_wheels, sensors
+from ptsmc_jax.devices import actuators, attitude_filter, attitude_sensors, sensors
 from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation import clock, rollout
 from ptsmc_jax.theory import lower_bound
@@ -277,7 +277,7 @@ def test_lower_bound_is_zero_without_noise():
 def test_wheel_momentum_couples_the_axes():
     """At rest with wheel momentum h a small rate obeys J dw' = h x dw."""
     momentum = np.array([3.0, -2.0, 1.0])
-    device = reaction_wheels.wheels(np.eye(3), momentum)
+    device = actuators.wheels(np.eye(3), momentum)
     calm = parts(**AT_REST, noise=(2e-5, 1e-6), disturbance=disturbances.Constant(jnp.zeros(3)))
     made = simulated_at(calm, actuators=actuators.Actuators(wheels=device))
     ticks, log = lower_bound._nonzero_periods(made, still(made))
