@@ -41,10 +41,10 @@ from ptsmc_jax.scenario import read as read
 from ptsmc_jax.scenario import replace as replace
 from ptsmc_jax.scenario import study as study
 from ptsmc_jax.scenario.errors import ScenarioError as ScenarioError
+from ptsmc_jax.scenario.reading import in_scenario as in_scenario
 from ptsmc_jax.scenario.tables import Scenario as Scenario
 from ptsmc_jax.scenario.timing import Reach as Reach
 from ptsmc_jax.scenario.timing import reach_of as reach_of
-from ptsmc_jax.scenario.reading import in_scenario as in_scenario
 from ptsmc_jax.signals.disturbances import Constant as Constant
 from ptsmc_jax.signals.disturbances import Disturbance as Disturbance
 from ptsmc_jax.signals.disturbances import Sinusoid as Sinusoid

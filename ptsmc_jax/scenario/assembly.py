@@ -1,8 +1,7 @@
 """Build everything that a run needs from a validated scenario: parts, dispersions, requirements. Start with `study`."""
 
-import dataclasses
 import typing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -117,7 +116,8 @@ def study(
     configure.warn_if_not_configured()
     scenario = reading.complete(reading.to_scenario(scenario))
     setup = build_setup(scenario)
-    parts = setup.with_clock(*timing.choose_timing(scenario, setup, reach or timing.reach_of(scenario), saves))
+    clock, substeps = timing.choose_timing(scenario, setup, reach or timing.reach_of(scenario), saves)
+    parts = replace(setup, clock=clock, substeps=substeps)
     dispersion = build_dispersion(scenario, parts)
     custom_checks.check(parts, dispersion, scenario)
     start_checks.check(scenario, parts, dispersion, dispersed=drawn)
@@ -132,7 +132,7 @@ def build_setup(scenario: Scenario) -> Setup:
     wheels = scenario.reaction_wheels
     actuators = scenario.devices.actuators(None if wheels is None else wheels.build())
     if getattr(getattr(scenario.dispersion, "wheel_failure", None), "known", False):
-        actuators = dataclasses.replace(actuators, spare_allocations=spare_allocations(actuators.wheels))
+        actuators = replace(actuators, spare_allocations=spare_allocations(actuators.wheels))
     command_filter = scenario.devices.command_filter
     return Setup(
         plant=plant,

@@ -1,7 +1,7 @@
-"""The parts of a run: `Parts`, and `Setup` without the clock."""
+"""The parts of a run."""
 
-from dataclasses import dataclass, field, fields, replace
-from typing import Any, TypeVar
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import jax.numpy as jnp
 from jax.tree_util import Partial
@@ -13,16 +13,13 @@ from ptsmc_jax.numerics.pytrees import Function, Leaf, is_function, pytree
 from ptsmc_jax.plants.base import Plant
 from ptsmc_jax.plants.rigid_body import spacecraft
 from ptsmc_jax.signals import disturbances
-from ptsmc_jax.simulation.clock import Anchored, Flight, Graded
 from ptsmc_jax.simulation.pointing import Pointing
-
-_Setup = TypeVar("_Setup", bound="Setup")
 
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
-class Setup:
-    """The parts of a run without its clock. `plant` is the true plant; law and observer have the design model."""
+class Parts:
+    """All parts of a run. `plant` is the true plant; law and observer have the design model."""
 
     plant: Plant
     disturbance: Any  # function: t [s], true state -> (m,) [N m]
@@ -39,6 +36,8 @@ class Setup:
     command_filter: CommandFilter | None = None  # filter between the law and the actuators
     jitter: Leaf | None = None  # largest error of a sample time, as a fraction of the control period [-]
     pointing: Pointing | None = None  # observation of pointing errors; None: the run has no pointing metrics
+    clock: Any = None  # `clock.Anchored`, `Flight` or `Graded` (continuous loop); None: not chosen yet
+    substeps: int = field(default=1, metadata={"static": True})  # RK4 steps of the plant in a control period
 
     def __post_init__(self) -> None:
         """Wrap functions of time as pytrees."""
@@ -52,12 +51,18 @@ class Setup:
         """The initial state in the form that the law can bring to the reference, see `Kinematics.align`."""
         return self.controller.kinematics.align(self.initial, self.reference(jnp.zeros_like(self.t_end)))
 
-    def with_t_f(self: _Setup, t_f: Leaf) -> _Setup:
+    @property
+    def period(self) -> Any:
+        """The control period of a sampled loop [s]."""
+        return self.clock.period
+
+    def with_t_f(self, t_f: Leaf) -> "Parts":
         """Return the parts with another prescribed time [s]; t_end moves with it."""
         t_end = t_f + (self.t_end - self.controller.t_f)
-        return replace(self, controller=replace(self.controller, t_f=t_f), t_end=t_end)
+        clock = None if self.clock is None else replace(self.clock, t_end=t_end)
+        return replace(self, controller=replace(self.controller, t_f=t_f), t_end=t_end, clock=clock)
 
-    def with_inertia(self: _Setup, inertia: Any, *, known: bool = True) -> _Setup:
+    def with_inertia(self, inertia: Any, *, known: bool = True) -> "Parts":
         """Return the parts of a spacecraft with another inertia, for the true body and its gravity gradient.
 
         Args:
@@ -84,32 +89,11 @@ class Setup:
                 changes["observer"] = replace(observer, model=with_new_inertia(observer.model, "model of the observer"))
         return replace(self, **changes)
 
-    def with_clock(self, clock: Anchored | Flight | Graded, substeps: int) -> "Parts":
-        """Return the parts of a run with this clock and number of integration steps in a control period."""
-        return Parts(clock=clock, substeps=substeps, **{f.name: getattr(self, f.name) for f in fields(self)})
+
+Setup = Parts  # parts whose clock is not chosen yet
 
 
 def check_parts(value: object) -> None:
     """Raise TypeError if the argument is not the parts of a run."""
-    if not isinstance(value, Setup):
+    if not isinstance(value, Parts):
         raise TypeError(f"parts are needed, such as study(scenario).parts, but this is a {type(value).__name__}")
-
-
-@pytree
-@dataclass(frozen=True, kw_only=True)
-class Parts(Setup):
-    """All parts of a run, including its clock."""
-
-    clock: Anchored | Flight | Graded  # Graded: continuous loop; the others: sampled loop
-    substeps: int = field(default=1, metadata={"static": True})  # RK4 steps of the plant in a control period
-
-    @property
-    def period(self) -> Any:
-        """The control period of a sampled loop [s]."""
-        clock: Any = self.clock
-        return clock.period
-
-    def with_t_f(self, t_f: Leaf) -> "Parts":
-        """Return the parts with another prescribed time [s]; t_end moves with it."""
-        parts = super().with_t_f(t_f)
-        return replace(parts, clock=replace(self.clock, t_end=parts.t_end))

@@ -113,8 +113,7 @@ def _convert_gain(name: str, value: Any) -> Array:
 
 def _check_clock(parts: Parts) -> None:
     """Raise ValueError if a clock has too few samples or steps for t_f and delta. Traced values are not checked."""
-    clock: Any = parts.clock
-    law = parts.controller
+    clock, law = parts.clock, parts.controller
     longest_step = clock.period if clock.sampled else clock.max_step  # [s]
     times = [law.t_f, law.delta, parts.t_end, longest_step]
     if any(isinstance(v, core.Tracer) or np.ndim(v) > 0 for v in times):
