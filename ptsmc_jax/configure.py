@@ -287,14 +287,11 @@ def _default_cache_folder() -> Path | None:
         base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     except RuntimeError:  # as in a container with an unknown user
         return None
-    return Path(base) / "ptsmc-jax" / hashlib.sha256(_describe_processor().encode()).hexdigest()[:12]
-
-
-def _describe_processor() -> str:
-    """Describe the processor: code compiled for one must not be loaded on another."""
+    # code compiled for one processor must not be loaded on another
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         properties = sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))})
     except OSError:
         properties = [platform.processor()]
-    return "\n".join([platform.machine(), *properties])
+    processor = "\n".join([platform.machine(), *properties])
+    return Path(base) / "ptsmc-jax" / hashlib.sha256(processor.encode()).hexdigest()[:12]

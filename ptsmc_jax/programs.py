@@ -74,21 +74,29 @@ class Program:
 
     It runs on the CPU even if JAX has a GPU: a GPU has no Schur decomposition, and takes many launches for a single
     run. A batch runs on JAX's default device.
+
+    Args:
+        function: a function at the top of a module of this project; others are compiled, but never stored.
+        static_argnames: names of the arguments that are constants of the program.
+        compiler_options: as of `jax.jit`; None: `BATCHED` for a batch, otherwise the defaults.
+        batch: run on JAX's default device instead of the CPU.
+        title: plural noun for progress reports; programs without a title are not reported, see `compiling`.
     """
 
     def __init__(
         self,
         function: Callable,
-        static: tuple[str, ...] = (),
-        options: dict[str, Any] | None = None,
+        static_argnames: str | tuple[str, ...] = (),
+        compiler_options: dict[str, Any] | None = None,
         *,
         batch: bool = False,
         title: str = "",
     ):
         functools.update_wrapper(self, function)
+        static = (static_argnames,) if isinstance(static_argnames, str) else static_argnames
         self._function, self._static, self._signature = function, static, inspect.signature(function)
         self._batch, self._title = batch, title
-        options = options or (BATCHED if batch else None)
+        options = compiler_options or (BATCHED if batch else None)
         self._jitted = jax.jit(function, static_argnames=static, compiler_options=options)
         self._stored = jax.jit(self._restored(), static_argnames=static, compiler_options=options)
         self._prepared: list[Future] = []
@@ -106,7 +114,12 @@ class Program:
             self._on_device(self._prepare, *args, **kwargs)
 
     def _on_device(self, method: Callable, *args: Any, **kwargs: Any) -> Any:
-        return method(*args, **kwargs) if self._batch else call_on_cpu(method, *args, **kwargs)
+        """Call a method on the CPU, even if JAX's default device is a GPU, unless this is a batch or is traced."""
+        if self._batch or configure.backend() == "cpu" or _is_traced(args, kwargs):
+            return method(*args, **kwargs)
+        args, kwargs = jax.tree.map(_to_host, (args, kwargs))
+        with jax.default_device(configure.processors()[0]):
+            return method(*args, **kwargs)
 
     def _run(self, *args: Any, **kwargs: Any) -> Any:
         if _is_traced(args, kwargs):
@@ -234,37 +247,9 @@ class Program:
         return configure.programs / f"{checksum}.stablehlo"
 
 
-def jit(
-    function: Callable | None = None,
-    *,
-    static_argnames: str | tuple[str, ...] = (),
-    compiler_options: dict | None = None,
-    batch: bool = False,
-    title: str = "",
-) -> Any:
-    """Return the `Program` of a function, or a decorator that does.
-
-    Args:
-        function: a function at the top of a module of this project; others are compiled, but never stored.
-        static_argnames: names of the arguments that are constants of the program.
-        compiler_options: as of `jax.jit`; None: `BATCHED` for a batch, otherwise the defaults.
-        batch: run on JAX's default device instead of the CPU.
-        title: plural noun for progress reports; programs without a title are not reported, see `compiling`.
-    """
-    if function is None:
-        options = {"static_argnames": static_argnames, "compiler_options": compiler_options, "batch": batch}
-        return functools.partial(jit, **options, title=title)
-    static = (static_argnames,) if isinstance(static_argnames, str) else static_argnames
-    return Program(function, static, compiler_options, batch=batch, title=title)
-
-
-def call_on_cpu(function: Callable, /, *args: Any, **kwargs: Any) -> Any:
-    """Call a function on the CPU, even if JAX's default device is a GPU. Calls with traced arguments are unchanged."""
-    if configure.backend() == "cpu" or _is_traced(args, kwargs):
-        return function(*args, **kwargs)
-    args, kwargs = jax.tree.map(_to_host, (args, kwargs))
-    with jax.default_device(configure.processors()[0]):
-        return function(*args, **kwargs)
+def jit(function: Callable | None = None, **options: Any) -> Any:
+    """Return the `Program` of a function with these options of `Program`, or a decorator that does."""
+    return functools.partial(Program, **options) if function is None else Program(function, **options)
 
 
 def _to_host(leaf: Any) -> Any:

@@ -176,10 +176,6 @@ class ComponentRules:
         same_size = eqn.invars[0].aval.dtype.itemsize == eqn.outvars[0].aval.dtype.itemsize
         return self._elementwise(eqn, values) if same_size else None
 
-    def _structural(self, eqn: Any, values: Sequence[BatchedArray]) -> list[np.ndarray]:
-        """Evaluate a primitive that only moves entries, such as a transpose."""
-        return pick_entries(eqn, [value.components for value in values])
-
     def _fold(self, name: str, *items: Any) -> Any:
         """Return the sum, product or extreme of components, by the function of `jax.lax` with this name."""
         if name in self.replacements:
@@ -352,7 +348,7 @@ _ON_ARRAYS = set(
 )
 _RULES: dict[str, Callable[[ComponentRules, Any, Sequence[BatchedArray]], list[np.ndarray] | None]] = {
     **dict.fromkeys(_ELEMENTWISE, ComponentRules._elementwise),
-    **dict.fromkeys(_STRUCTURAL, ComponentRules._structural),
+    **dict.fromkeys(_STRUCTURAL, lambda _, eqn, values: pick_entries(eqn, [value.components for value in values])),
     **dict.fromkeys(_REDUCTIONS, ComponentRules._reduction),
     **dict.fromkeys(_CUMULATIVE, ComponentRules._cumulative),
     "reshard": lambda rules, eqn, values: [values[0].components],  # resharding on one device is the identity

@@ -145,11 +145,6 @@ def _to_unit_interval(word: Array) -> Array:
     return jnp.minimum((word.astype(dtype) + dtype.type(0.5)) * dtype.type(2.0**-32), below_one)
 
 
-def _uniform_pair(a: Word, b: Word) -> tuple[Array, Array]:
-    """Return two uniform numbers from two words."""
-    return _to_unit_interval(a), _to_unit_interval(b)
-
-
 @jax.jit
 def _normal_pair(a: Word, b: Word) -> tuple[Array, Array]:
     """Return two standard normal numbers from two words."""
@@ -160,7 +155,10 @@ def _normal_pair(a: Word, b: Word) -> tuple[Array, Array]:
 
 Distribution = Literal["uniform", "normal"]
 # functions that convert two words to two random numbers
-DISTRIBUTIONS: dict[Distribution, Callable] = {"uniform": _uniform_pair, "normal": _normal_pair}
+DISTRIBUTIONS: dict[Distribution, Callable] = {
+    "uniform": lambda a, b: (_to_unit_interval(a), _to_unit_interval(b)),
+    "normal": _normal_pair,
+}
 
 
 def _interleave(pairs: tuple[Array, Array], count: int) -> Array:

@@ -203,10 +203,6 @@ class Segments(NamedTuple):
             self.filled + 1,
         )
 
-    def without_segments(self) -> "Segments":
-        """Return the buffer without segments."""
-        return Segments(self.ends, jnp.zeros_like(self.lengths), jnp.zeros_like(self.filled))
-
     def time_beyond(self, mean: Array, limits: Float[Array, "4"]) -> Float[Array, "4"]:
         """Return the time in which the error minus its mean is beyond limits [s]; NaN if a segment was dropped."""
 
@@ -316,7 +312,8 @@ def update(
         segments, beyond = present_window.segments, jnp.zeros(4)
         if segments is not None:
             beyond = segments.time_beyond(mean, limits[2])
-            segments = segments.without_segments().with_segment(last_error, error.end, length * (1.0 - end_fraction))
+            empty = Segments(segments.ends, jnp.zeros_like(segments.lengths), jnp.zeros_like(segments.filled))
+            segments = empty.with_segment(last_error, error.end, length * (1.0 - end_fraction))
         projections = _projections(last_error)
         next_window = Window(next_integral, projections, projections, segments).with_error(error.end)
         if isinstance(error, ConstantPath):  # the error jumps here: its old value is not part of the next window
