@@ -11,43 +11,6 @@ from typing import Any
 Ask = Callable[[Any], Any]
 
 
-class _Task:
-    """A task in its own thread, and its current request."""
-
-    def __init__(self, work: Callable[[Ask], None], condition: threading.Condition):
-        self._work, self._condition = work, condition
-        self.request: Any = None
-        self.is_waiting = self.has_ended = False
-        self.error: BaseException | None = None
-        self._answer: Any = None
-
-    def start(self) -> None:
-        threading.Thread(target=self._run_work, daemon=True).start()
-
-    def _run_work(self) -> None:
-        """Run the work of this task in its thread, record an error, and notify that the task has ended."""
-        try:
-            self._work(self._ask)
-        except BaseException as error:
-            self.error = error
-        with self._condition:
-            self.has_ended = True
-            self._condition.notify_all()
-
-    def _ask(self, request: Any) -> Any:
-        with self._condition:
-            self.request, self.is_waiting = request, True
-            self._condition.notify_all()
-            self._condition.wait_for(lambda: not self.is_waiting)
-        if isinstance(self._answer, BaseException):
-            raise self._answer
-        return self._answer
-
-    def set_answer(self, answer: Any) -> None:
-        """Set the answer to the request. If the answer is an exception, it is raised inside the task."""
-        self._answer, self.is_waiting = answer, False
-
-
 def run_in_lockstep(
     functions: Sequence[Callable[[Ask], None]], answer: Callable[[list[Any]], list[Any]], width: int
 ) -> None:
@@ -67,34 +30,53 @@ def run_in_lockstep(
             is first raised inside the functions that wait.
     """
     condition = threading.Condition()
-    pending, active, failure = [_Task(work, condition) for work in functions], list[_Task](), None
+    requests, answers = dict[int, Any](), dict[int, Any]()  # of the functions that wait, by their numbers
+    ended = dict[int, BaseException | None]()  # exceptions of the functions that have ended
 
-    def all_stopped() -> bool:
-        return all(task.is_waiting or task.has_ended for task in active)
+    def run(number: int) -> None:
+        def ask(request: Any) -> Any:
+            with condition:
+                requests[number] = request
+                condition.notify_all()
+                condition.wait_for(lambda: number in answers)
+                received = answers.pop(number)
+            if isinstance(received, BaseException):
+                raise received
+            return received
 
+        exception = None
+        try:
+            functions[number](ask)
+        except BaseException as error:
+            exception = error
+        with condition:
+            ended[number] = exception
+            condition.notify_all()
+
+    running, started, failure = set[int](), 0, None
     with condition:
         while True:
-            failure = failure or next((task.error for task in active if task.error is not None), None)
-            active[:] = [task for task in active if not task.has_ended]
-            while pending and failure is None and len(active) < width:
-                active.append(pending.pop(0))
-                active[-1].start()
-            if not active:
+            failure = failure or next(filter(None, ended.values()), None)
+            running.difference_update(ended)
+            while started < len(functions) and failure is None and len(running) < width:
+                threading.Thread(target=run, args=(started,), daemon=True).start()
+                running.add(started)
+                started += 1
+            if not running:
                 break
             try:
-                condition.wait_for(all_stopped)
+                condition.wait_for(lambda: running <= requests.keys() | ended.keys())
                 if failure is not None:
                     raise failure
-                # otherwise another function starts first, and its request joins this batch
-                if not any(task.has_ended for task in active):
-                    answers = answer([task.request for task in active])
-                    for task, task_answer in zip(active, answers, strict=True):
-                        task.set_answer(task_answer)
+                # if a function has ended, another function starts first, and its request joins this batch
+                if running.isdisjoint(ended):
+                    numbers = sorted(running)
+                    answers.update(zip(numbers, answer([requests[k] for k in numbers]), strict=True))
+                    requests.clear()
             except BaseException as error:
                 failure = error
-                for task in active:
-                    if task.is_waiting:
-                        task.set_answer(failure)
+                answers.update(dict.fromkeys(requests, failure))
+                requests.clear()
             condition.notify_all()
     if failure is not None:
         raise failure
