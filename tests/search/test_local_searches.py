@@ -129,12 +129,9 @@ def test_a_search_ends_at_the_best_compromise_and_finds_the_limits_that_conflict
     ("relaxed", "x0"),
     [
         (None, 0.3),  # F is least on the first limit
-        (local_search.Relaxed(beyond_limits=True), 0.4),  # both are 0.2 inside their limits
-        (
-            local_search.Relaxed(rows=[0], beyond_limits=True),
-            0.6,
-        ),  # as far inside the first limit as the second one allows
-        (local_search.Relaxed(rows=[1], beyond_limits=True), 0.3),
+        (range(3), 0.4),  # both are 0.2 inside their limits
+        ([0], 0.6),  # as far inside the first limit as the second one allows
+        ([1], 0.3),
     ],
 )
 def test_a_local_search_minimises_the_objective_or_the_violation_of_some_limits(relaxed, x0):

@@ -110,14 +110,6 @@ class _FeasibleError(Exception):
     """A point meets every limit. The search continues from it and minimises the objective."""
 
 
-@dataclass(frozen=True)
-class Relaxed:
-    """Limits whose largest violation is minimised instead of the objective."""
-
-    rows: Sequence[int] | None = None  # indices of these limits among the rows of c; None: all limits
-    beyond_limits: bool = False  # continue after every limit is met, to maximise the distance from the limits
-
-
 def search_locally(
     measure: Callable[[np.ndarray], MeasurementWithGradients],
     best: Best,
@@ -125,7 +117,7 @@ def search_locally(
     steps: int,
     on_accepted: Callable[[MeasurementWithGradients], None] = lambda _: None,
     tolerance: float = F_TOLERANCE,
-    relaxed: Relaxed | None = None,
+    relaxed: Sequence[int] | None = None,
     steepest: float = STEEPEST,
 ) -> None:
     """Search locally from a starting point inside the bounds, by sequential quadratic programming (SLSQP).
@@ -143,7 +135,8 @@ def search_locally(
         steps: largest number of points to measure.
         on_accepted: is called with the measurement at each accepted point, but not during line searches.
         tolerance: change of F at which the search ends.
-        relaxed: if given, only the violation of these limits is minimised, and the other limits are constraints.
+        relaxed: if given, indices of limits among the rows of c. The search then minimises their largest c instead of
+            the objective, also below 0. The other limits are constraints.
         steepest: largest element of the gradients of F and c; larger gradients are scaled down.
     """
     local = _LocalSearch(measure, best, start, steps, on_accepted, tolerance, steepest)
@@ -151,52 +144,51 @@ def search_locally(
     with contextlib.suppress(_StepLimitError):
         on_accepted(local.at(first))
         if relaxed is not None:
-            local.minimise_violation(first, relaxed)
+            local.minimise_largest(first, relaxed)
             return
         if local.violation(first) > ELASTIC:
-            first = local.minimise_violation(first, Relaxed())
+            first = local.minimise_largest(first)
             if local.violation(first) > SLACK:
                 return
         last = local.minimise(first)
         if local.violation(last) > SLACK:
-            feasible = local.minimise_violation(last, Relaxed())
+            feasible = local.minimise_largest(last)
             if local.violation(feasible) <= SLACK:
                 local.minimise(feasible)
 
 
+@dataclass
 class _LocalSearch:
-    """The two optimisation problems of a local search, with shared measurements.
+    """The two optimisation problems of a local search, with shared measurements, see `search_locally`.
 
     Variables are normalised gains times the scaling.
     """
 
-    def __init__(
-        self,
-        measure: Callable[[np.ndarray], MeasurementWithGradients],
-        best: Best,
-        start: Start,
-        steps: int,
-        on_accepted: Callable[[MeasurementWithGradients], None],
-        tolerance: float,
-        steepest: float,
-    ):
-        self._steepest = steepest
-        self._measure, self._best, self._start = measure, best, start
-        self._steps, self._on_accepted, self._tolerance = steps, on_accepted, tolerance
-        self._measurements, self._scale = start.measurements, start.scale
-        scaled = self._scale * start.normalised
-        self._bounds = [(value, value) if k in start.fixed else (0.0, self._scale) for k, value in enumerate(scaled)]
+    measure: Callable[[np.ndarray], MeasurementWithGradients]
+    best: Best
+    start: Start
+    steps: int
+    on_accepted: Callable[[MeasurementWithGradients], None]
+    tolerance: float
+    steepest: float
+
+    @property
+    def bounds(self) -> list[tuple[float, float]]:
+        """The bounds of the variables."""
+        scaled = enumerate(self.start.scale * self.start.normalised)
+        return [(value, value) if k in self.start.fixed else (0.0, self.start.scale) for k, value in scaled]
 
     def at(self, scaled: np.ndarray) -> MeasurementWithGradients:
         """Return the measurement at a point. A point is measured once."""
-        key, point = scaled.tobytes(), np.clip(scaled / self._scale, 0.0, 1.0)[None]
-        if key not in self._measurements:
-            if len(self._measurements) == self._steps:
+        key, point = scaled.tobytes(), np.clip(scaled / self.start.scale, 0.0, 1.0)[None]
+        measurements = self.start.measurements
+        if key not in measurements:
+            if len(measurements) == self.steps:
                 raise _StepLimitError
-            self._measurements[key] = self._measure(point)
-        if self._measurements[key].finite[0]:
-            self._best.offer(point, self._measurements[key])
-        return self._measurements[key]
+            measurements[key] = self.measure(point)
+        if measurements[key].finite[0]:
+            self.best.offer(point, measurements[key])
+        return measurements[key]
 
     def violation(self, scaled: np.ndarray) -> float:
         """Return the largest c of the completed trials."""
@@ -206,63 +198,66 @@ class _LocalSearch:
         """Minimise F subject to c <= 0, and return the last point."""
         limits = {
             "type": "ineq",
-            "fun": lambda x: -_compress(self.at(x), self._steepest)[0],
-            "jac": lambda x: -_compress(self.at(x), self._steepest)[1] / self._scale,
+            "fun": lambda x: -_compress(self.at(x), self.steepest)[0],
+            "jac": lambda x: -_compress(self.at(x), self.steepest)[1] / self.start.scale,
         }
         result = minimize(
             lambda x: float(self.at(x).f[0]),
             scaled.copy(),
-            jac=lambda x: _clip(self.at(x).f_gradient, self._steepest)[0] / self._scale,
+            jac=lambda x: _clip(self.at(x).f_gradient, self.steepest)[0] / self.start.scale,
             method="SLSQP",
-            bounds=self._bounds,
+            bounds=self.bounds,
             constraints=[limits] if self.at(scaled).c.shape[1] else [],
             callback=self._report_accepted,
-            options={"maxiter": self._steps, "ftol": self._tolerance},
+            options={"maxiter": self.steps, "ftol": self.tolerance},
         )
-        return np.clip(result.x, *np.transpose(self._bounds))
+        return np.clip(result.x, *np.transpose(self.bounds))
 
-    def minimise_violation(self, scaled: np.ndarray, relaxed: Relaxed) -> np.ndarray:
-        """Minimise t subject to c <= t. Return the first point that meets every limit, or else the last point."""
+    def minimise_largest(self, scaled: np.ndarray, relaxed: Sequence[int] | None = None) -> np.ndarray:
+        """Minimise t subject to c <= t for the limits in `relaxed`, and c <= 0 for the others. Return the last point.
+
+        None: minimise t for all limits, and return the first point that meets every limit if there is one.
+        """
         rows, trials = self.at(scaled).c.shape[1:]
         if not rows:
             return scaled
-        is_relaxed = np.repeat(np.isin(np.arange(rows), range(rows) if relaxed.rows is None else relaxed.rows), trials)
+        is_relaxed = np.repeat(np.isin(np.arange(rows), range(rows) if relaxed is None else relaxed), trials)
         feasible_point = np.array(scaled)
 
         def measure_limits(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             nonlocal feasible_point
             measured = self.at(x)
-            if not relaxed.beyond_limits and relaxed.rows is None and ignore_failures(measured.c).max() <= 0.0:
+            if relaxed is None and ignore_failures(measured.c).max() <= 0.0:
                 feasible_point = np.array(x)
                 raise _FeasibleError
-            return _compress(measured, self._steepest)
+            return _compress(measured, self.steepest)
 
         limits = {
             "type": "ineq",
             "fun": lambda y: y[-1] * is_relaxed - measure_limits(y[:-1])[0],
-            "jac": lambda y: np.column_stack([-measure_limits(y[:-1])[1] / self._scale, is_relaxed.astype(float)]),
+            "jac": lambda y: np.column_stack([-measure_limits(y[:-1])[1] / self.start.scale, is_relaxed.astype(float)]),
         }
-        first_violation = _compress(self.at(scaled), self._steepest)[0][is_relaxed].max()
+        first_violation = _compress(self.at(scaled), self.steepest)[0][is_relaxed].max()
         try:
             result = minimize(
                 lambda y: y[-1],
                 np.append(scaled, first_violation),
                 jac=lambda y: np.append(np.zeros(scaled.size), 1.0),
                 method="SLSQP",
-                bounds=[*self._bounds, (-1.0, None)],
+                bounds=[*self.bounds, (-1.0, None)],
                 constraints=[limits],
                 callback=lambda y: self._report_accepted(y[:-1]),
-                options={"maxiter": self._steps, "ftol": self._tolerance},
+                options={"maxiter": self.steps, "ftol": self.tolerance},
             )
         except _FeasibleError:
             return feasible_point
-        return np.clip(result.x[:-1], *np.transpose(self._bounds))
+        return np.clip(result.x[:-1], *np.transpose(self.bounds))
 
     def _report_accepted(self, scaled: np.ndarray) -> None:
         """Call `on_accepted` with the measurement at a point that SLSQP has accepted."""
         key = np.ascontiguousarray(scaled).tobytes()
-        if key in self._measurements:
-            self._on_accepted(self._measurements[key])
+        if key in self.start.measurements:
+            self.on_accepted(self.start.measurements[key])
 
 
 def _compress(measured: MeasurementWithGradients, steepest: float) -> tuple[np.ndarray, np.ndarray]:

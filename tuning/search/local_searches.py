@@ -22,7 +22,6 @@ from tuning.search.local_search import (
     F_TOLERANCE,
     SLACK,
     Best,
-    Relaxed,
     Start,
     estimate_multipliers,
     largest_ratios,
@@ -61,14 +60,6 @@ class Step:
     gains: np.ndarray  # (gains,)
     value: float  # objective over the training trials; NaN if no trial completes
     worst: np.ndarray  # (requirements,) largest metric / limit; infinite if a trial fails
-
-
-@dataclass(frozen=True)
-class _Contender:
-    """A starting point in successive halving, and the history that led to it."""
-
-    start: Start
-    before: list[Step]
 
 
 def _few_trials(problem: Problem) -> Problem:
@@ -236,7 +227,7 @@ class LocalSearches:
             replace_best: replace the best point so far by the first result, because the problem has changed.
         """
         contenders = {
-            k: _Contender(Start(normalised, scalings[k % len(scalings)]), list(self._history.get(k, ())))
+            k: (Start(normalised, scalings[k % len(scalings)]), list(self._history.get(k, ())))
             for k, normalised in starts.items()
         }
         ranked = list(starts)
@@ -252,16 +243,25 @@ class LocalSearches:
         return ranked
 
     def _search_in_lockstep(
-        self, problem: Problem, contenders: Mapping[int, _Contender], steps: int, step_name: str, *, replace_best: bool
+        self,
+        problem: Problem,
+        contenders: Mapping[int, tuple[Start, list[Step]]],
+        steps: int,
+        step_name: str,
+        *,
+        replace_best: bool,
     ) -> None:
-        """Run local searches from these starting points, `SEARCHES_PER_DEVICE` at a time for each device."""
+        """Run local searches, `SEARCHES_PER_DEVICE` at a time for each device.
+
+        `contenders` has the starting point of each local search, and the history before it.
+        """
         tightened, bests, reports = self.tightened(problem), dict[int, Best](), 0
 
         def search(k: int, ask: Ask) -> None:
-            start, record = contenders[k].start, partial(self._record, k)
+            start, before = contenders[k]
             bests[k] = self._new_best(problem, start.normalised)
-            self._history[k] = list(contenders[k].before)  # the longer search records them again
-            search_locally(ask, bests[k], start, steps, record, relaxed=_relaxed(problem))
+            self._history[k] = list(before)  # the longer search records the points of the shorter one again
+            search_locally(ask, bests[k], start, steps, partial(self._record, k), relaxed=_relaxed(problem))
 
         def report_new_searches() -> None:
             """Report the progress once for each local search that has begun since the last call."""
@@ -386,8 +386,8 @@ class LocalSearches:
                 row_ratios = largest_ratios(measured.c, 0.0)[0]
                 ratios.append((float(row_ratios[others].max(initial=0.0)), float(row_ratios[row])))
 
-            best, relaxed = self._new_best(tightened, self.normalised), Relaxed(rows=[int(row)], beyond_limits=True)
-            search_locally(measure, best, Start(self.normalised, CAREFUL), self._steps, record_ratios, relaxed=relaxed)
+            best, start = self._new_best(tightened, self.normalised), Start(self.normalised, CAREFUL)
+            search_locally(measure, best, start, self._steps, record_ratios, relaxed=[int(row)])
             kept = [ratio for largest_other, ratio in ratios if largest_other <= 1.0 + 10.0 * SLACK]
             margin = float(np.broadcast_to(self._margin, worst.size)[row])
             smallest_ratios[problem.rows[row]] = (1.0 - margin) * min(kept) if kept else None
@@ -523,9 +523,9 @@ class LocalSearches:
         return problem.tightened(1.0 - self._margin)
 
 
-def _relaxed(problem: Problem) -> Relaxed | None:
-    """Return the limits whose largest violation is minimised; None: F is minimised subject to the limits."""
-    return Relaxed(beyond_limits=True) if problem.objective == LIMITS else None
+def _relaxed(problem: Problem) -> Sequence[int] | None:
+    """Return the indices of the limits whose largest c is minimised; None: F is minimised subject to the limits."""
+    return range(len(problem.rows)) if problem.objective == LIMITS else None
 
 
 def _ranked(ends: Mapping[int, Best]) -> list[tuple[int, Best]]:
