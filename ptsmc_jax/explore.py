@@ -131,7 +131,7 @@ class Simulation:
 
     def to_polars(self) -> pl.DataFrame:
         """Return the history, one row per sample: t [s], state, estimate, delivered torque, sliding variable, error."""
-        return pl.DataFrame({**self.run.columns(), **runs.numbered_columns("error", self.run.log.error)})
+        return pl.DataFrame({**self.run.columns(), **runs.numbered_columns({"error": self.run.log.error})})
 
     def __repr__(self) -> str:
         return "\n".join([self._ending(), repr(self.metrics), *map(str, self.verdicts)])

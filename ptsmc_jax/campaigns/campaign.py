@@ -17,7 +17,7 @@ from ptsmc_jax import configure, programs
 from ptsmc_jax.batching import lanes
 from ptsmc_jax.campaigns import montecarlo, run_tables
 from ptsmc_jax.campaigns.montecarlo import CustomMetrics
-from ptsmc_jax.campaigns.rows import Part, Rows, read
+from ptsmc_jax.campaigns.rows import Part, Rows, column_names, read
 from ptsmc_jax.campaigns.run_tables import RunTable
 from ptsmc_jax.devices.sensors import RATE_BIAS
 from ptsmc_jax.dispersions.base import CUSTOM
@@ -43,11 +43,6 @@ class Campaign:
     custom_metrics: CustomMetrics | None = None
     run_table: RunTable | None = None  # a row for each trial
     software: Software = PYTHON_SOFTWARE  # flight software: the simulated law, or exported C code
-
-    @property
-    def table_sets_values(self) -> bool:
-        """Whether the campaign has a run table that sets a quantity."""
-        return self.run_table is not None and bool(self.run_table.given)
 
     def rows(self, trials: np.ndarray) -> np.ndarray | Row:
         """Return the numbers of these trials, or their rows in the run table."""
@@ -84,7 +79,8 @@ class Campaign:
         return pl.DataFrame({"trial": wanted, **self._trial_and_seed_columns(wanted), **numbers})
 
     def _trial_and_seed_columns(self, trials: np.ndarray) -> dict[str, np.ndarray]:
-        return {} if self.run_table is None else self.run_table.trial_and_seed_columns(trials)
+        stated = {} if self.run_table is None else self.run_table.streams
+        return {run_tables.RESULT_COLUMNS[name]: values[trials] for name, values in stated.items()}
 
     def custom_metric_names(self) -> list[str]:
         """Return the names of the custom metrics. Raises ValueError if they fail or a row cannot hold them."""
@@ -99,9 +95,8 @@ class Campaign:
                 file = getattr(getattr(function, "__code__", None), "co_filename", "")
                 raise ValueError(f"it {custom_checks.describe_failure(error, file)}") from error
             if not isinstance(returned, dict) or not returned or not all(isinstance(name, str) for name in returned):
-                returned_type = (
-                    "an empty dict" if isinstance(returned, dict) and not returned else type(returned).__name__
-                )
+                is_empty = isinstance(returned, dict) and not returned
+                returned_type = "an empty dict" if is_empty else type(returned).__name__
                 raise ValueError(f"it returns {returned_type}, but must return named numbers, a dict")
             for name, value in returned.items():
                 is_single = isinstance(value, int | float | np.generic | np.ndarray | jax.Array) and not np.ndim(value)
@@ -165,11 +160,9 @@ def from_run_table(
         if np.array_equal(np.broadcast_to(usual_values, values.shape), values):
             unchanged.append(name)
     campaign = Campaign(ready, seed, custom_metrics, table.without(unchanged))
-    if table.angle is not None or table.custom:
-        rows = drawn if drawn is not None and not campaign.table_sets_values else campaign.draw(range(table.count))
-        run_tables.check_custom_numbers(table.custom, rows, where)
-        if table.angle is not None:
-            run_tables.check_angle(table.angle, rows[run_tables.ANGLE].to_numpy(), where)
+    if table.dependent:
+        rows = drawn if drawn is not None and len(unchanged) == len(table.given) else campaign.draw(range(table.count))
+        run_tables.check_dependent(table.dependent, rows, where)
     return campaign
 
 
@@ -192,12 +185,6 @@ def missing_parts(parts: Iterable[Part], trials: int, shard: tuple[int, int] = (
     return [(first, count) for first, count in all_parts[number - 1 :: shards] if counts.get(first, 0) < count]
 
 
-def kept_parts(parts: Iterable[Part], to_simulate: Iterable[Block]) -> list[Part]:
-    """Return the parts on disk that count as done, because they are not among the blocks that are simulated next."""
-    simulated_again = {first for first, _ in to_simulate}
-    return [part for part in parts if part.first not in simulated_again]
-
-
 @dataclass
 class Tally:
     """The progress of a campaign, for progress reports."""
@@ -207,15 +194,23 @@ class Tally:
     failed: int  # number of failed trials
 
 
-def count_progress(parts: list[Part], total: int) -> Tally:
-    """Return the progress of a campaign whose parts on disk are these."""
-    failed = sum(count_failures(read([part], ["status"])) for part in parts)
-    return Tally(sum(part.count for part in parts), total, failed)
+def count_progress(parts: Iterable[Part], total: int, to_simulate: Iterable[Block] = ()) -> Tally:
+    """Return the progress of a campaign.
+
+    Args:
+        parts: parts on disk.
+        total: number of all trials.
+        to_simulate: the blocks that are simulated next. Parts that begin like one of them are replaced and not counted.
+    """
+    simulated_again = {first for first, _ in to_simulate}
+    done = [part for part in parts if part.first not in simulated_again]
+    failed = sum(count_failures(read([part], ["status"])) for part in done if "status" in column_names(part))
+    return Tally(sum(part.count for part in done), total, failed)
 
 
 def count_failures(frame: pl.DataFrame) -> int:
-    """Return the number of failed trials in these rows."""
-    return int((frame["status"] != "ok").sum())
+    """Return the number of failed trials in these rows; 0 for rows that were not simulated."""
+    return int((frame["status"] != "ok").sum()) if "status" in frame.columns else 0
 
 
 def has_finished(frame: pl.DataFrame) -> np.ndarray:
@@ -251,7 +246,7 @@ def make_parts(
         for first, count in group:
             part = frame.slice(first_row, count)
             first_row += count
-            parts.append((rows.write(first, part), count_failures(part) if "status" in part.columns else 0))
+            parts.append((rows.write(first, part), count_failures(part)))
         return parts
 
     workers = ThreadPoolExecutor(2)  # one thread simulates while the other writes rows

@@ -10,7 +10,6 @@ import io
 import json
 import os
 import re
-import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +19,6 @@ import polars as pl
 from ptsmc_jax.campaigns import store
 
 FOLDER = "trials"  # subfolder of a campaign with its parts
-RECENT_CHANGE = 1_000_000_000  # [ns] a file that changed so recently may change again with the same time of change
 _NAME = re.compile(r"(\d{10})-(\d{10})-([0-9a-f]{32})\.parquet")
 
 
@@ -51,13 +49,10 @@ class Rows:
     key: bytes  # key of the checksums in the file names, see `campaign_key`
 
     def write(self, first: int, frame: pl.DataFrame) -> Part:
-        """Write a part: first a temporary file, which is renamed when it is on disk."""
-        return self.put(first, frame.height, encode_parquet(frame))
-
-    def put(self, first: int, count: int, content: bytes) -> Part:
-        """Write a part with this content. Raises OSError if the disk is full."""
+        """Write a part, as a temporary file that is renamed at the end. Raises OSError if the disk is full."""
+        count, content = frame.height, encode_parquet(frame)
         self.folder.mkdir(parents=True, exist_ok=True)
-        path = self.folder / f"{first:010d}-{first + count - 1:010d}-{self._checksum(first, count, content)}.parquet"
+        path = self.folder / f"{first:010d}-{first + count - 1:010d}-{self.checksum(first, count, content)}.parquet"
         with store.replace_file(path) as temporary, temporary.open("xb") as file:
             file.write(content)
             file.flush()
@@ -70,7 +65,9 @@ class Rows:
         for path in sorted(self.folder.glob("*.parquet")):
             name = _NAME.fullmatch(path.name)
             first, count = (int(name[1]), int(name[2]) - int(name[1]) + 1) if name else (0, 0)
-            if name is not None and self._checksum_of(path, first, count) == name[3]:
+            status = path.stat()
+            version = status.st_ino, status.st_size, status.st_mtime_ns
+            if name is not None and _file_checksum(self, path, version, first, count) == name[3]:
                 complete.append(Part(first, count, path))
             else:
                 damaged.append(path)
@@ -89,23 +86,20 @@ class Rows:
             if path not in kept and has_part_name(path):
                 path.unlink(missing_ok=True)
 
-    def _checksum_of(self, path: Path, first: int, count: int) -> str:
-        """Return the checksum of a file's content; an unchanged file is not read again."""
-        status = path.stat()
-        if time.time_ns() - status.st_mtime_ns < RECENT_CHANGE:
-            return self._checksum(first, count, path.read_bytes())
-        return _checksum_of_version(self, path, (status.st_ino, status.st_size, status.st_mtime_ns), first, count)
-
-    def _checksum(self, first: int, count: int, content: bytes) -> str:
+    def checksum(self, first: int, count: int, content: bytes) -> str:
+        """Return the checksum of a part with this content."""
         checksum = hashlib.blake2b(content, digest_size=16, key=self.key)
         checksum.update(f"{first}+{count}".encode())
         return checksum.hexdigest()
 
 
 @functools.cache
-def _checksum_of_version(rows: Rows, path: Path, version: tuple[int, int, int], first: int, count: int) -> str:
-    """Return the checksum of a file's content; version: inode, size and time of the last change [ns]."""
-    return rows._checksum(first, count, path.read_bytes())
+def _file_checksum(rows: Rows, path: Path, version: tuple[int, int, int], first: int, count: int) -> str:
+    """Return the checksum of a file. An unchanged file is not read again.
+
+    version: inode, size and time of the last change [ns].
+    """
+    return rows.checksum(first, count, path.read_bytes())
 
 
 def campaign_key(scenario: store.Tables, made_by: store.Tables) -> bytes:

@@ -37,33 +37,26 @@ class RunTable:
     """A run table that `check_table` has checked."""
 
     given: dict[str, np.ndarray]  # numbers (rows, n) by the names of `QUANTITIES`
-    trial: np.ndarray | None  # (rows,) trial numbers that the table states
-    seed: np.ndarray | None  # (rows,) seeds that the table states
-    angle: np.ndarray | None  # (rows,) initial angle of the table [rad]
     count: int  # number of rows
-    custom: dict[str, np.ndarray] = field(default_factory=dict)  # (rows,) numbers of custom dispersions, by name
+    streams: dict[str, np.ndarray] = field(default_factory=dict)  # (rows,) by TRIAL and SEED, if the table states them
+    dependent: dict[str, np.ndarray] = field(default_factory=dict)  # (rows,) by column, see `check_dependent`
 
     @property
     def checksum(self) -> str:
         """SHA-256 of its trials: tables with the same trials have the same checksum."""
         checksum = hashlib.sha256(str(self.count).encode())
-        for name, values in [*sorted(self.given.items()), *self._random_number_columns.items()]:
+        for name, values in [*sorted(self.given.items()), *self.streams.items()]:
             plain = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
             checksum.update(name.encode() + plain.tobytes())
         return checksum.hexdigest()
 
-    @property
-    def _random_number_columns(self) -> dict[str, np.ndarray]:
-        """The columns that name the random numbers of the rows, if any."""
-        return {name: values for name, values in ((TRIAL, self.trial), (SEED, self.seed)) if values is not None}
-
     def rows(self, numbers: np.ndarray, seed: int) -> np.ndarray | Row:
         """Return these rows, or numbers of trials if the table sets nothing; numbers: (rows,) from 0; seed: default."""
         numbers = np.asarray(numbers, dtype=np.uint32)
-        trial = numbers if self.trial is None else self.trial[numbers]
-        if not self.given and self.seed is None:
+        trial = self.streams[TRIAL][numbers] if TRIAL in self.streams else numbers
+        if not self.given and SEED not in self.streams:
             return trial
-        seeds = np.full_like(numbers, seed) if self.seed is None else self.seed[numbers]
+        seeds = self.streams[SEED][numbers] if SEED in self.streams else np.full_like(numbers, seed)
         return Row(seeds, trial, {name: values[numbers] for name, values in self.given.items()})
 
     def row(self, number: int, seed: int) -> int | Row:
@@ -75,30 +68,34 @@ class RunTable:
         """Return the table without the columns of these quantities, which it then does not set."""
         return replace(self, given={name: values for name, values in self.given.items() if name not in quantities})
 
-    def trial_and_seed_columns(self, numbers: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the trial numbers and seeds that the table states for these rows, by column of a campaign's rows."""
-        return {RESULT_COLUMNS[name]: values[numbers] for name, values in self._random_number_columns.items()}
-
     def frame(self, parts: Parts) -> pl.DataFrame:
         """Return the table as a data frame, in one form for equal run tables."""
-        columns = self._random_number_columns
+        columns = dict(self.streams)
         for name, values in self.given.items():
             columns |= dict(zip(QUANTITIES[name].columns(parts), values.T, strict=True))
         return pl.DataFrame(columns or {TRIAL: np.arange(self.count, dtype=np.uint32)})
 
 
-def read(path: Path) -> pl.DataFrame:
-    """Return the table of a file, or of a folder that `--dry-run` wrote. Raises RefusedError if it is not a table."""
+def read(path: Path, name: str = "--runs", allowed: str = ALLOWED) -> pl.DataFrame:
+    """Return the table of a .csv or .parquet file, or of a folder that `--dry-run` wrote.
+
+    Args:
+        path: the file or folder.
+        name: name of the table in errors.
+        allowed: the allowed files, for errors.
+
+    Raises:
+        RefusedError: it does not exist, has another type or cannot be read.
+    """
     if not path.exists():
-        raise RefusedError(f"--runs is {path}, which does not exist; allowed is {ALLOWED}")
+        raise RefusedError(f"{name} is {path}, which does not exist; allowed is {allowed}")
     files = sorted(path.glob("*.parquet")) if path.is_dir() else [path]
-    kinds = {file.suffix.lower() for file in files}
-    if not kinds or not (kinds == {".parquet"} or kinds == {".csv"}):
-        raise RefusedError(f"--runs is {path}, but must be {ALLOWED}")
+    if not files or files[0].suffix.lower() not in (".csv", ".parquet"):
+        raise RefusedError(f"{name} is {path}, but must be {allowed}")
     try:
         return pl.concat([csv_tables.read_table(file) for file in files])
     except (ValueError, pl.exceptions.PolarsError) as error:
-        raise RefusedError(f"--runs is {path}, which cannot be read: {str(error).splitlines()[0]}") from None
+        raise RefusedError(f"{name} is {path}, which cannot be read: {str(error).splitlines()[0]}") from None
 
 
 def check_table(
@@ -115,7 +112,7 @@ def check_table(
         parts: the nominal parts; the quantities depend on them.
         where: the name of the table in errors.
         custom_metrics: names of custom metrics, which are allowed as columns.
-        drawn: names of the numbers of custom dispersions, see `check_custom_numbers`.
+        drawn: names of the numbers of custom dispersions, see `check_dependent`.
 
     Returns:
         The checked run table.
@@ -124,37 +121,28 @@ def check_table(
         RefusedError: a column is unknown or lacks the others of its vector, a cell is empty or not a finite number, or
             a value cannot be simulated. The sentence names column and row, counted from 0.
     """
-    if not 1 <= table.height <= MOST_TRIALS:
-        count = "no rows" if not table.height else f"{table.height} rows"
-        limit = "must have one for each trial" if not table.height else f"at most {MOST_TRIALS} are allowed"
-        raise RefusedError(f"{where} has {count}, but {limit}")
+    if not table.height:
+        raise RefusedError(f"{where} has no rows, but must have one for each trial")
     columns_of = {name: quantity.columns(parts) for name, quantity in QUANTITIES.items()}
     quantity_of = {column: name for name, columns in columns_of.items() for column in columns}
-    for column in table.columns:
-        if column not in (
-            *quantity_of,
-            *RESULT_COLUMNS,
-            *RESULT_COLUMNS.values(),
-            ANGLE,
-            *RESULTS,
-            *SAMPLES,
-            *custom_metrics,
-            *drawn,
-        ):
-            suggestion = parsing.nearest_name_hint(column, (*quantity_of, *RESULT_COLUMNS))
-            raise RefusedError(f"{where} has the column {column}, which no trial of this scenario has; {suggestion}")
+    stream_columns = {*RESULT_COLUMNS, *RESULT_COLUMNS.values()}
+    known = {*quantity_of, *stream_columns, ANGLE, *RESULTS, *SAMPLES, *custom_metrics, *drawn}
+    unknown = next((column for column in table.columns if column not in known), None)
+    if unknown is not None:
+        hint = parsing.nearest_name_hint(unknown, (*quantity_of, *RESULT_COLUMNS))
+        raise RefusedError(f"{where} has the column {unknown}, which no trial of this scenario has; {hint}")
     given: dict[str, np.ndarray] = {}
     for column in table.columns:
-        columns = columns_of.get(quantity_of.get(column, ""), [])
-        missing_column = next((column_name for column_name in columns if column_name not in table.columns), None)
-        if missing_column is not None:
-            raise RefusedError(
-                f"{where} has the column {column}, but not {missing_column}: {_column_range(columns)} come together"
-            )
-        if columns and quantity_of[column] not in given:
-            given[quantity_of[column]] = np.stack(
-                [_finite_numbers(table, column_name, where) for column_name in columns], axis=1
-            )
+        name = quantity_of.get(column)
+        if name is None or name in given:
+            continue
+        columns = columns_of[name]
+        for other in columns:
+            if other not in table.columns:
+                raise RefusedError(
+                    f"{where} has the column {column}, but not {other}: {_column_range(columns)} come together"
+                )
+        given[name] = np.stack([_finite_numbers(table, other, where) for other in columns], axis=1)
     name = ""
     try:
         for name, values in given.items():
@@ -165,35 +153,34 @@ def check_table(
         row, columns = ", ".join(f"{v:.9g}" for v in given[name][error.row]), columns_of[name]
         heading = columns[0] if len(columns) == 1 else f"{_column_range(columns)} ="
         raise _row_error(where, heading, error.row, row, str(error)) from None
-    stated_numbers = {}
+    streams = {}
     for name, other in RESULT_COLUMNS.items():  # the rows of a campaign state these numbers in `other`
         column = other if other in table.columns else name
-        stated_numbers[name] = _whole_numbers(table, column, where) if column in table.columns else None
-    if stated_numbers[TRIAL] is not None and np.array_equal(stated_numbers[TRIAL], np.arange(table.height)):
-        stated_numbers[TRIAL] = None  # row k has the number k of a trial, as by default
-    angle = _finite_numbers(table, ANGLE, where) if ANGLE in table.columns else None
-    custom_numbers = {name: _to_numbers(table[name]) for name in drawn if name in table.columns}
-    return RunTable(given, stated_numbers[TRIAL], stated_numbers[SEED], angle, table.height, custom_numbers)
+        if column in table.columns:
+            streams[name] = _whole_numbers(table, column, where)
+    if TRIAL in streams and np.array_equal(streams[TRIAL], np.arange(table.height)):
+        del streams[TRIAL]  # row k has the number k of a trial, as by default
+    dependent = {name: _to_numbers(table[name]) for name in (ANGLE, *drawn) if name in table.columns}
+    return RunTable(given, table.height, streams, dependent)
 
 
-def check_angle(stated: np.ndarray, simulated: np.ndarray, where: str) -> None:
-    """Raise RefusedError if the table's initial angles (rows,) do not follow from its other columns."""
-    is_wrong = np.abs(simulated - stated) > 1e-5 * np.maximum(1.0, np.abs(stated))
-    rule = "follows from the rest, or no such column"
-    _check_rows(is_wrong, where, ANGLE, stated, lambda row: f"{simulated[row]:.9g} there, which {rule}")
+def check_dependent(stated: dict[str, np.ndarray], rows: pl.DataFrame, where: str) -> None:
+    """Raise RefusedError if columns that a table cannot set have other values than its trials.
 
+    These columns are the initial angle, which follows from other columns, and the numbers of custom dispersions, since
+    only `Draw.at` knows the parts that follow from them.
 
-def check_custom_numbers(stated: dict[str, np.ndarray], rows: pl.DataFrame, where: str) -> None:
-    """Raise RefusedError if the table has other numbers of custom dispersions, (rows,) by name, than the trials.
-
-    A table cannot set them, since only `Draw.at` knows the parts that follow from them.
+    Args:
+        stated: values in the table (rows,), by column.
+        rows: the rows of the trials.
+        where: the name of the table in errors.
     """
-    rule = "is the number of its trial and seed, or no such column: a run table cannot set custom dispersions"
+    rule = "is the value of this trial, or no such column: a run table cannot set it"
     for name, values in stated.items():
         numbers = _to_numbers(rows[name])
-        tolerance = 1e-5 * np.max(np.abs(numbers), initial=0.0, where=np.isfinite(numbers))
-        is_same = (np.abs(numbers - values) <= tolerance) | (np.isnan(numbers) & np.isnan(values))
-        _check_rows(
+        largest = np.max(np.abs(numbers), initial=1.0 if name == ANGLE else 0.0, where=np.isfinite(numbers))
+        is_same = (np.abs(numbers - values) <= 1e-5 * largest) | (np.isnan(numbers) & np.isnan(values))
+        check_rows(
             ~is_same, where, name, values, lambda row, numbers=numbers: f"{numbers[row]:.9g} there, which {rule}"
         )
 
@@ -208,19 +195,27 @@ def _row_error(where: str, column: str, row: int, value: object, allowed: str) -
     return RefusedError(f"{where} has {column} {shown} in row {row}, but must have {allowed}")
 
 
-def _check_rows(
-    is_bad: np.ndarray, where: str, column: str, values: pl.Series | np.ndarray, allowed: Callable[[int], str]
+def check_rows(
+    is_bad: np.ndarray, where: str, column: str, values: pl.Series | np.ndarray, allowed: str | Callable[[int], str]
 ) -> None:
-    """Raise RefusedError for the first bad row (rows,) of a column, if any; allowed: describes the allowed values."""
+    """Raise RefusedError for the first row of a column that `is_bad` (rows,) marks, if there is one.
+
+    Args:
+        is_bad: which rows are bad.
+        where: the name of the table in errors.
+        column: name of the column.
+        values: its values (rows,).
+        allowed: the allowed values in words, or a function of the row that returns them.
+    """
     if is_bad.any():
         row = int(np.argmax(is_bad))
-        raise _row_error(where, column, row, values[row], allowed(row))
+        raise _row_error(where, column, row, values[row], allowed if isinstance(allowed, str) else allowed(row))
 
 
 def _finite_numbers(table: pl.DataFrame, column: str, where: str) -> np.ndarray:
     """Return a column of finite numbers, (rows,). Raises RefusedError if a cell is not a finite number."""
     numbers = _to_numbers(table[column])
-    _check_rows(~np.isfinite(numbers), where, column, table[column], lambda _: "a finite number")
+    check_rows(~np.isfinite(numbers), where, column, table[column], "a finite number")
     return numbers
 
 
@@ -235,5 +230,5 @@ def _whole_numbers(table: pl.DataFrame, column: str, where: str) -> np.ndarray:
     """Return a column of whole numbers below 2^32, (rows,). Raises RefusedError if a cell is not such a number."""
     values = _finite_numbers(table, column, where)
     is_bad = (values != np.floor(values)) | (values < 0) | (values >= MOST_TRIALS)
-    _check_rows(is_bad, where, column, table[column], lambda _: f"a whole number from 0 to {MOST_TRIALS - 1}")
+    check_rows(is_bad, where, column, table[column], f"a whole number from 0 to {MOST_TRIALS - 1}")
     return values.astype(np.uint32)

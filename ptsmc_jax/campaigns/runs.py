@@ -1,7 +1,7 @@
 """One run of a scenario, with its history, metrics and verdicts as plain numbers."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -72,10 +72,7 @@ class Run:
         if log.wheels is not None:
             blocks["h"], blocks["v"] = log.wheels
         blocks |= self.parts.plant.hidden_columns(log.x) | self._measured_columns()
-        columns = {"t": np.asarray(log.t)}
-        for name, block in blocks.items():
-            columns |= numbered_columns(name, block)
-        return columns
+        return {"t": np.asarray(log.t), **numbered_columns(blocks)}
 
     def _measured_columns(self) -> dict[str, np.ndarray]:
         """Return the readings of the sensors and the torque that the computer sends, empty if they are not logged.
@@ -103,14 +100,24 @@ class Run:
         return jax.tree.map(np.asarray, columns)
 
 
-def numbered_columns(name: str, block: ArrayLike) -> dict[str, np.ndarray]:
-    """Return the columns of a (time, component) array, named by a number from 1; of a (time,) array, the column."""
-    if np.ndim(block) == 1:
-        return {name: np.asarray(block)}
-    return {f"{name}{k + 1}": column for k, column in enumerate(np.asarray(block).T)}
+def numbered_columns(blocks: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:
+    """Return the columns of (time, component) arrays, named by a number from 1; of (time,) arrays, the column."""
+    columns = {}
+    for name, block in blocks.items():
+        values = np.asarray(block)
+        numbered = {name: values} if values.ndim == 1 else {f"{name}{k + 1}": v for k, v in enumerate(values.T)}
+        columns |= numbered
+    return columns
 
 
-def simulate(ready: Study, seed: int = 0, trial: int | Row | None = None, software: Software = PYTHON_SOFTWARE) -> Run:
+def simulate(
+    ready: Study,
+    seed: int = 0,
+    trial: int | Row | None = None,
+    software: Software = PYTHON_SOFTWARE,
+    *,
+    with_margins: bool = True,
+) -> Run:
     """Simulate one run of a scenario with its history, and judge its requirements.
 
     Args:
@@ -119,17 +126,11 @@ def simulate(ready: Study, seed: int = 0, trial: int | Row | None = None, softwa
         trial: the number of a trial, or a row of a run table, with its dispersions and noise. None: the nominal run
             with the noise of trial 0.
         software: flight software: the simulated law, or exported C code.
+        with_margins: whether to judge the required margins too.
 
     Returns:
         The run with its verdicts.
     """
-    run = _simulate_without_margins(ready, seed, trial, software)
-    return replace(run, verdicts=[*run.verdicts, *margin_verdicts.judge_loop(run.parts, ready.margins)])
-
-
-def _simulate_without_margins(
-    ready: Study, seed: int, trial: int | Row | None, software: Software = PYTHON_SOFTWARE
-) -> Run:
     row = trial if isinstance(trial, Row) else Row(np.uint32(seed), np.uint32(trial or 0), {})
     key, number = np.uint32(row.seed), np.uint32(row.trial)
     number_or_row = trial if isinstance(trial, Row) else number
@@ -144,6 +145,8 @@ def _simulate_without_margins(
     metrics = {name: float(getattr(result.metrics, name)) for name in ready.catalogue}
     finished = np.asarray(int(result.status) in rollout.FINISHED)
     verdicts = requirements.verdicts(ready.requirements, metrics.__getitem__, finished)
+    if with_margins:
+        verdicts += margin_verdicts.judge_loop(parts, ready.margins)
     samples = {name: int(count) for name, count in result.samples.items()}
     return Run(parts, log, metrics, ready.catalogue, status, reason, float(result.bad_time), verdicts, samples)
 
@@ -172,7 +175,6 @@ def rms_lower_bound(ready: Study, seed: int = 0, rows: Sequence[int | Row] = ())
         The bound, or None if no run has one.
     """
     trials = rows or (range(BOUND_TRIALS) if ready.dispersion.varies else (None,))
-    runs = [_simulate_without_margins(ready, seed, trial) for trial in trials]
-    return lower_bound.pool_bounds(
-        lower_bound.bounds_along_runs([(run.parts, run.log) for run in runs if run.has_lower_bound])
-    )
+    runs = [simulate(ready, seed, trial, with_margins=False) for trial in trials]
+    bounds = lower_bound.bounds_along_runs([(run.parts, run.log) for run in runs if run.has_lower_bound])
+    return float(np.sqrt(np.mean([bound.window_error**2 for bound in bounds]))) if bounds else None

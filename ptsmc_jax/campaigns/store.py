@@ -2,7 +2,6 @@
 
 import contextlib
 import csv
-import glob
 import importlib.metadata
 import json
 import math
@@ -213,7 +212,6 @@ def is_empty(folder: Path) -> bool:
 def lock_folder(folder: Path, *, force: bool = True, shared: bool = False) -> Iterator[None]:
     """Lock a result folder while this process writes into it; the lock ends with the process, even if it is killed.
 
-    At the end, the last process that holds the lock removes the temporary folders of killed ones, see `write_folder`.
     Platforms without `fcntl` and file systems without locks are not protected.
 
     Args:
@@ -236,9 +234,7 @@ def lock_folder(folder: Path, *, force: bool = True, shared: bool = False) -> It
         yield
     finally:
         with contextlib.suppress(OSError), lock:
-            if _lock(lock, shared=False):  # raises an error if other processes share the lock
-                for leftover in path.parent.glob(f"{glob.escape(path.stem)}{TEMPORARY_PREFIX}????????"):
-                    shutil.rmtree(leftover, ignore_errors=True)
+            _lock(lock, shared=False)  # raises an error if other processes share the lock
             path.unlink()
         for parent in new_parents:
             with contextlib.suppress(OSError):  # the folder is not empty
@@ -268,17 +264,15 @@ def _open_locked(path: Path, *, shared: bool) -> IO[str] | None:
     return None
 
 
-def _lock(file: IO[str], *, shared: bool) -> bool:
-    """Lock an open file; return False without locks. Raises BlockingIOError if another process holds the lock."""
+def _lock(file: IO[str], *, shared: bool) -> None:
+    """Lock an open file, if there are locks. Raises BlockingIOError if another process holds the lock."""
     if fcntl is None:
-        return False
+        return
     try:
         fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise
-    except OSError:  # the file system has no locks
-        return False
-    return True
+    except OSError as error:  # the file system may have no locks
+        if isinstance(error, BlockingIOError):
+            raise
 
 
 def check_file(file: Path, force: bool, option: str = "--force") -> None:

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 import polars as pl
 
+from ptsmc_jax.campaigns import runs
 from ptsmc_jax.identification import estimation, parameters
 from ptsmc_jax.identification.estimation import Search
 from ptsmc_jax.identification.parameters import Problem
@@ -72,7 +73,7 @@ def design(
     shapes = np.stack([np.sin(np.pi * k * t / t[-1]) for k in HALF_WAVES])  # (waves, rows) for unit amplitudes
     log = _log_at_rest(loaded, t)
     problem = parameters.build(loaded, [log])
-    limits = _Limits.from_scenario(loaded, problem, rate, torque)
+    scale_momentum = _momentum_scaler(loaded, problem, rate, torque)
     search = Search(problem, [], np.inf, lambda text: None)
 
     def information(momentum: np.ndarray) -> tuple[np.ndarray, Measurements]:
@@ -85,7 +86,7 @@ def design(
         return float(np.sum(np.log(np.maximum(eigenvalues, 1e-12))))
 
     inputs = log.command.shape[1]
-    plain_momentum = limits.scale_momentum(_slew_each_axis(t, inputs), period)
+    plain_momentum = scale_momentum(_slew_each_axis(t, inputs))
     best, amplitudes = log_determinant(plain_momentum), None
     chosen, random = plain_momentum, np.random.default_rng(0)
     for k in range(CANDIDATES + REFINEMENTS):
@@ -93,7 +94,7 @@ def design(
             candidate = random.standard_normal((inputs, len(HALF_WAVES)))
         else:
             candidate = amplitudes + 0.5 * np.std(amplitudes) * random.standard_normal(amplitudes.shape)
-        momentum = limits.scale_momentum((candidate @ shapes).T, period)
+        momentum = scale_momentum((candidate @ shapes).T)
         value = log_determinant(momentum)
         if value > best:
             best, amplitudes, chosen = value, candidate, momentum
@@ -113,40 +114,35 @@ def design(
     )
 
 
-@dataclass(frozen=True)
-class _Limits:
-    """Limits of a manoeuvre's rate, torque and wheel momentum, and the maps from body momentum to rate and wheels."""
+def _momentum_scaler(
+    loaded: Any, problem: Problem, rate: float, torque: float | None
+) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a function that scales a momentum profile (rows, m) [N m s] to 95 % of the tightest limit.
 
-    torque: float  # largest allowed torque about an axis [N m]
-    rate: float  # largest allowed rate about an axis [rad/s]
-    inertia_inverse: np.ndarray  # (m, m) map from momentum to rate
-    allocation: np.ndarray  # (channels, m) torque of each channel for a unit torque about each axis
-    momentum: float  # largest allowed momentum of each wheel [N m s], infinite without a limit
+    The limits are those of torque, rate and wheel momentum. Raises ScenarioError if no limit of the torque is known.
+    """
+    wheels = loaded.reaction_wheels
+    limits = [torque, loaded.devices.torque_limit, None if wheels is None else wheels.torque_limit]
+    known = [limit for limit in limits if limit is not None]
+    if not known:
+        raise ScenarioError(
+            "hardware.torque_limit is absent, but a design needs the largest torque; allowed is --torque too"
+        )
+    plant, actuators, largest_torque = problem.model.plant, problem.model.actuators, min(known)
+    allocation = np.eye(plant.inputs) if actuators.wheels is None else np.asarray(actuators.wheels.allocation)
+    wheel_limit = np.inf if wheels is None or wheels.momentum_limit is None else wheels.momentum_limit
 
-    @staticmethod
-    def from_scenario(loaded: Any, problem: Problem, rate: float, torque: float | None) -> "_Limits":
-        wheels = loaded.reaction_wheels
-        limits = [torque, loaded.devices.torque_limit, None if wheels is None else wheels.torque_limit]
-        known = [limit for limit in limits if limit is not None]
-        if not known:
-            raise ScenarioError(
-                "hardware.torque_limit is absent, but a design needs the largest torque; allowed is --torque too"
-            )
-        plant, actuators = problem.model.plant, problem.model.actuators
-        channels = np.eye(plant.inputs) if actuators.wheels is None else np.asarray(actuators.wheels.allocation)
-        momentum = np.inf if wheels is None or wheels.momentum_limit is None else wheels.momentum_limit
-        return _Limits(min(known), rate, np.asarray(plant.inertia_inverse), channels, momentum)
-
-    def scale_momentum(self, momentum: np.ndarray, period: float) -> np.ndarray:
-        """Return a momentum profile (rows, m) that is scaled to 95 % of the tightest limit."""
-        wheel_momentum, torque = momentum @ self.allocation.T, np.diff(momentum, axis=0) / period
+    def scale(momentum: np.ndarray) -> np.ndarray:
+        torque = np.diff(momentum, axis=0) / loaded.loop.period
         ratios = [
-            np.max(np.abs(torque)) / self.torque,
-            np.max(np.abs(torque @ self.allocation.T)) / self.torque,
-            np.max(np.abs(momentum @ self.inertia_inverse.T)) / self.rate,
-            np.max(np.abs(wheel_momentum)) / self.momentum,
+            np.max(np.abs(torque)) / largest_torque,
+            np.max(np.abs(torque @ allocation.T)) / largest_torque,
+            np.max(np.abs(momentum @ np.asarray(plant.inertia_inverse).T)) / rate,
+            np.max(np.abs(momentum @ allocation.T)) / wheel_limit,
         ]
         return momentum * (0.95 / max(ratios))
+
+    return scale
 
 
 def _slew_each_axis(t: np.ndarray, inputs: int) -> np.ndarray:
@@ -188,8 +184,6 @@ def _predict_readings(problem: Problem, search: Search, log: Measurements) -> Me
 
 
 def _to_frame(log: Measurements) -> pl.DataFrame:
-    columns = {"t": log.t}
-    blocks = {"attitude": "measured_q", "rate": "measured_w", "x": "measured_x"}
-    for name, values in (*log.readings.items(), ("sent", log.command)):
-        columns |= {f"{blocks.get(name, name)}{k + 1}": column for k, column in enumerate(values.T)}
-    return pl.DataFrame(columns)
+    names = {"attitude": "measured_q", "rate": "measured_w", "x": "measured_x"}
+    blocks = {**{names[name]: values for name, values in log.readings.items()}, "sent": log.command}
+    return pl.DataFrame({"t": log.t, **runs.numbered_columns(blocks)})

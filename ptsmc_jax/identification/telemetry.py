@@ -13,8 +13,8 @@ import numpy as np
 import polars as pl
 from scipy.spatial.transform import Rotation
 
+from ptsmc_jax.campaigns import run_tables
 from ptsmc_jax.campaigns.store import RefusedError
-from ptsmc_jax.numerics import csv_tables
 from ptsmc_jax.scenario.identify_tables import StateTelemetry, Telemetry
 from ptsmc_jax.scenario.parsing import nearest_name_hint
 from ptsmc_jax.scenario.tables import Scenario
@@ -47,15 +47,7 @@ def read(path: Path) -> pl.DataFrame:
     Raises:
         RefusedError: the file is missing, has another type or is damaged.
     """
-    allowed = "a .csv or .parquet file with a row for each time"
-    if not path.is_file():
-        raise RefusedError(f"there is no file {path}; a log is {allowed}")
-    if path.suffix.lower() not in (".csv", ".parquet"):
-        raise RefusedError(f"the log is {path}, but must be {allowed}")
-    try:
-        return csv_tables.read_table(path)
-    except ValueError as error:
-        raise RefusedError(f"the log {path} cannot be read: {error}") from None
+    return run_tables.read(path, "the log", "a .csv or .parquet file with a row for each time")
 
 
 def measurements(scenario: Scenario, frame: pl.DataFrame, name: str = "the log") -> Measurements:
@@ -74,13 +66,10 @@ def measurements(scenario: Scenario, frame: pl.DataFrame, name: str = "the log")
             counted from 0.
     """
     table = _Table(frame, name)
-    spacecraft = scenario.plant.kind == "spacecraft"
-    config: Any = scenario.telemetry or (Telemetry() if spacecraft else StateTelemetry())
     if frame.height < MIN_ROWS:
         raise RefusedError(f"{name} has {frame.height} rows, but must have at least {MIN_ROWS}")
-    t = table.read_times(config.time)
-    read_log = _read_spacecraft_log if spacecraft else _read_state_log
-    return read_log(scenario, config, table, t)
+    read_log = _read_spacecraft_log if scenario.plant.kind == "spacecraft" else _read_state_log
+    return read_log(scenario, table)
 
 
 class _Table:
@@ -89,21 +78,9 @@ class _Table:
     def __init__(self, frame: pl.DataFrame, name: str):
         self.frame, self.name = frame, name
 
-    def make_error(self, column: str, row: int, allowed: str) -> RefusedError:
-        """Return the error for a value of a column."""
-        value = self.frame[column][row]
-        value_text = "empty" if value is None else value
-        return RefusedError(f"{self.name} has {column} {value_text} in row {row}, but must have {allowed}")
-
     def check_rows(self, is_bad: Values, column: str, allowed: str | Callable[[int], str]) -> None:
         """Raise RefusedError for the first row that `is_bad` (rows,) marks, if there is one."""
-        if is_bad.any():
-            row = int(np.argmax(is_bad))
-            raise self.make_error(column, row, allowed if isinstance(allowed, str) else allowed(row))
-
-    def has_any(self, columns: Sequence[str]) -> bool:
-        """Return whether the log has at least one of the columns."""
-        return any(column in self.frame.columns for column in columns)
+        run_tables.check_rows(is_bad, self.name, column, self.frame[column], allowed)
 
     def column(self, column: str) -> pl.Series:
         """Return a column. Raises RefusedError if the log does not have it."""
@@ -128,11 +105,13 @@ class _Table:
         """Return columns of vectors, which are complete or blank in each row; see `read_numbers`."""
         values = self.read_numbers(columns, unit)
         is_blank = np.isnan(values)
-        is_partly_blank = is_blank.any(axis=1) & ~is_blank.all(axis=1)
-        if is_partly_blank.any():
-            row = int(np.argmax(is_partly_blank))
-            blank, filled = columns[int(np.argmax(is_blank[row]))], columns[int(np.argmin(is_blank[row]))]
-            raise self.make_error(blank, row, f"a number there, since {filled} has one")
+        for k, name in enumerate(columns):
+            is_incomplete = is_blank[:, k] & ~is_blank.all(axis=1)
+            self.check_rows(
+                is_incomplete,
+                name,
+                lambda row: f"a number there, since {columns[int(np.argmin(is_blank[row]))]} has one",
+            )
         return values
 
     def read_times(self, column: str) -> Values:
@@ -175,9 +154,10 @@ def _numbered_columns(prefix: str, count: int) -> list[str]:
     return [f"{prefix}{k + 1}" for k in range(count)]
 
 
-def _read_state_log(scenario: Scenario, config: Any, table: _Table, t: Values) -> Measurements:
+def _read_state_log(scenario: Scenario, table: _Table) -> Measurements:
     """Return the log of a chain or a custom system."""
-    states, inputs = len(scenario.plant.x0), scenario.inputs
+    states, inputs, config = len(scenario.plant.x0), scenario.inputs, scenario.telemetry or StateTelemetry()
+    t = table.read_times(config.time)
     for key, count in (("state", states), ("input", inputs)):
         columns = getattr(config, key)
         if columns is not None and len(columns) != count:
@@ -191,14 +171,16 @@ def _read_state_log(scenario: Scenario, config: Any, table: _Table, t: Values) -
     return Measurements(table.name, t[start:] - t[start], {"x": x[start:]}, command[start:])
 
 
-def _read_spacecraft_log(scenario: Scenario, config: Any, table: _Table, t: Values) -> Measurements:
+def _read_spacecraft_log(scenario: Scenario, table: _Table) -> Measurements:
     """Return the log of a spacecraft, starting at the first row with an attitude."""
-    readings = {}
+    config: Any = scenario.telemetry or Telemetry()
+    t, readings = table.read_times(config.time), {}
+    logged = set(table.frame.columns)
     columns = config.attitude or _numbered_columns("measured_q", 4)
-    if config.attitude is not None or table.has_any(columns):
+    if config.attitude is not None or logged.intersection(columns):
         readings["attitude"] = _read_attitudes(config, table, columns)
     columns = config.rate or _numbered_columns("measured_w", 3)
-    if config.rate is not None or table.has_any(columns):
+    if config.rate is not None or logged.intersection(columns):
         readings["rate"] = table.read_vectors(columns, UNITS["rad/s"][config.rate_unit])
     if not readings or all(np.isnan(values).all() for values in readings.values()):
         raise RefusedError(
@@ -206,7 +188,7 @@ def _read_spacecraft_log(scenario: Scenario, config: Any, table: _Table, t: Valu
             "such as attitude = [..] or rate = [..]"
         )
     command, by_channel = _read_torques_or_speeds(scenario, config, table, t)
-    age_column = config.attitude_age or ("measured_age" if table.has_any(["measured_age"]) else None)
+    age_column = config.attitude_age or ("measured_age" if "measured_age" in logged else None)
     if age_column is not None and "attitude" in readings:
         ages = np.nan_to_num(table.read_numbers([age_column])[:, 0])
         table.check_rows(ages < 0.0, age_column, "an age of at least 0 s")
@@ -261,26 +243,24 @@ def _read_attitudes(config: Any, table: _Table, columns: Sequence[str]) -> Value
 
 def _read_torques_or_speeds(scenario: Any, config: Any, table: _Table, t: Values) -> tuple[Values, bool]:
     """Return the commands (rows, channels), and `by_channel` of `Measurements`."""
-    count = 3 if scenario.wheels is None else len(scenario.wheels.spin_axes())
-    for key in ("wheel_torque", "wheel_speed"):
-        columns = getattr(config, key)
-        if columns is None:
-            continue
-        if scenario.wheels is None:
-            raise RefusedError(f"telemetry.{key} needs [wheels] in the scenario")
-        if len(columns) != count:
-            raise RefusedError(f"telemetry.{key} has {len(columns)} columns, but must have {count}, one for each wheel")
-        if key == "wheel_torque":
-            return table.read_commands(columns, UNITS["N m"][config.torque_unit]), True
-        speeds = table.read_numbers(columns, RPM if config.speed_unit == "rpm" else 1.0)
-        for k, column in enumerate(columns):
-            has_speed = ~np.isnan(speeds[:, k])
-            if not has_speed.any():
-                raise RefusedError(f"{table.name} has no number in the column {column}, but must have one")
-            speeds[:, k] = np.interp(t, t[has_speed], speeds[has_speed, k])
-        return speeds, True
-    columns = config.torque or _numbered_columns("sent", 3)
-    return table.read_commands(columns, UNITS["N m"][config.torque_unit]), False
+    key = "wheel_torque" if config.wheel_torque is not None else "wheel_speed"
+    columns, torque_unit = getattr(config, key), UNITS["N m"][config.torque_unit]
+    if columns is None:
+        return table.read_commands(config.torque or _numbered_columns("sent", 3), torque_unit), False
+    if scenario.wheels is None:
+        raise RefusedError(f"telemetry.{key} needs [wheels] in the scenario")
+    count = len(scenario.wheels.spin_axes())
+    if len(columns) != count:
+        raise RefusedError(f"telemetry.{key} has {len(columns)} columns, but must have {count}, one for each wheel")
+    if key == "wheel_torque":
+        return table.read_commands(columns, torque_unit), True
+    speeds = table.read_numbers(columns, RPM if config.speed_unit == "rpm" else 1.0)
+    for k, column in enumerate(columns):
+        has_speed = ~np.isnan(speeds[:, k])
+        if not has_speed.any():
+            raise RefusedError(f"{table.name} has no number in the column {column}, but must have one")
+        speeds[:, k] = np.interp(t, t[has_speed], speeds[has_speed, k])
+    return speeds, True
 
 
 def _move_to_measurement_times(

@@ -22,7 +22,7 @@ Read `bound_along_run` first.
 """
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -85,7 +85,12 @@ def bounds_along_runs(runs: Sequence[tuple[Parts, Log]]) -> list[LowerBound]:
             groups.setdefault((delay, np.isfinite(model.noise).tobytes(), *map(np.shape, model)), {})[k] = model
     squares = [np.zeros((len(ticks.t), 3)) for _, ticks, _ in nonzero]
     for (delay, *_), models in groups.items():
-        sizes = _significant_deviations(_stack_models([*models.values()]), delay)
+        start, *others = zip(*models.values(), strict=True)  # stacked along an axis of the runs, see `Model`
+        model = Model(np.stack(start), *(np.stack(arrays, axis=1) for arrays in others))
+        sizes = deviations(model, delay)
+        if not np.all(model.noise > 0.0):
+            # deviations that result only from the noise assumed for exact sensors, see `EXACT`, are proportional to it
+            sizes = np.where(sizes > 3.0 * deviations(model, delay, EXACT / 10.0), 0.0, sizes)
         for place, k in enumerate(models):
             squares[k] = np.sum(sizes[:, place].reshape(len(sizes), 3, -1) ** 2, axis=2)
     # `squares` are mean squares of the error at the start, in the middle and at the end of each period
@@ -93,12 +98,6 @@ def bounds_along_runs(runs: Sequence[tuple[Parts, Log]]) -> list[LowerBound]:
         LowerBound(window_error(parts, ticks, of_run), np.asarray(ticks.t_next), np.sqrt(of_run[:, 2]))
         for (parts, ticks, _), of_run in zip(nonzero, squares, strict=True)
     ]
-
-
-def _stack_models(models: Sequence[Model]) -> Model:
-    """Stack the models of several runs along an axis of the runs, see `Model`."""
-    start, *others = zip(*models, strict=True)
-    return Model(np.stack(start), *(np.stack(arrays, axis=1) for arrays in others))
 
 
 def window_error(parts: Parts, ticks: Ticks, squares: np.ndarray) -> float:
@@ -113,12 +112,6 @@ def window_error(parts: Parts, ticks: Ticks, squares: np.ndarray) -> float:
     start, middle, end = squares.T
     total = np.sum(integral_in_window(ticks.t, ticks.t_next, (start, middle, end), Criteria(*times)))
     return float(np.sqrt(total / float(parts.window)))
-
-
-def pool_bounds(bounds: Iterable[LowerBound]) -> float | None:
-    """Return the RMS of the bounds of several runs, pooled like window errors, or None without runs."""
-    squares = [bound.window_error**2 for bound in bounds]
-    return float(np.sqrt(np.mean(squares))) if squares else None
 
 
 def _nonzero_periods(parts: Parts, log: Log) -> tuple[Any, Any]:
@@ -138,15 +131,6 @@ def _nonzero_periods(parts: Parts, log: Log) -> tuple[Any, Any]:
 @programs.jit
 def _ticks(clock: Any, t_f: Array, delta: Array) -> Ticks:
     return clock.ticks(t_f, delta)
-
-
-def _significant_deviations(model: Model, delay: int) -> np.ndarray:
-    """Return `deviations`, but 0 for deviations that result only from the noise `EXACT` assumed for exact sensors."""
-    sizes = deviations(model, delay)
-    if np.all(model.noise > 0.0):
-        return sizes
-    # such deviations are proportional to the assumed noise: a tenth of the noise gives a tenth of the deviation
-    return np.where(sizes > 3.0 * deviations(model, delay, EXACT / 10.0), 0.0, sizes)
 
 
 def deviations(model: Model, delay: int = 0, exact: float = EXACT) -> np.ndarray:

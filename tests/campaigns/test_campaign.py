@@ -254,14 +254,15 @@ def test_lower_bound_is_pooled_over_the_first_trials_or_rows(monkeypatch, varies
     """Trial k has the lower bound k + 1. The second simulated trial fails and has no bound."""
     seen: list[Any] = []
 
-    def fly(ready, seed, trial):
+    def fly(ready, seed, trial, *, with_margins):
+        assert not with_margins
         seen.append((seed, trial))
         return SimpleNamespace(has_lower_bound=len(seen) != 2, parts=1.0 + (trial or 0), log=None)
 
     def along_each(simulated):
         return [lower_bound.LowerBound(bound, np.zeros(1), np.zeros(1)) for bound, _ in simulated]
 
-    monkeypatch.setattr(runs, "_simulate_without_margins", fly)
+    monkeypatch.setattr(runs, "simulate", fly)
     monkeypatch.setattr(lower_bound, "bounds_along_runs", along_each)
     ready: Any = SimpleNamespace(dispersion=SimpleNamespace(varies=varies))
     squares = [(1.0 + (k or 0)) ** 2 for j, k in enumerate(simulated) if j != 1]

@@ -443,24 +443,28 @@ def test_inconsistent_initial_angle_is_refused(everything):
 def test_tolerance_of_the_initial_angle_allows_rounded_tables(angle, least):
     """The tolerance is 1e-5 rad, or 1e-5 relative to a state |x_1| above 1."""
     said, off = np.array([1.0, angle]), np.array([0.0, least])
-    run_tables.check_angle(said, said + 0.9 * off, "the run table")
+
+    def check(simulated):
+        run_tables.check_dependent({"initial_angle": said}, pl.DataFrame({"initial_angle": simulated}), "the run table")
+
+    check(said + 0.9 * off)
     with pytest.raises(RefusedError, match="in row 1, but must have"):
-        run_tables.check_angle(said, said + 1.1 * off, "the run table")
+        check(said + 1.1 * off)
 
 
 def test_run_tables_of_different_trials_have_different_checksums():
     """Values, names, trials, seeds and the number of rows change the checksum. The initial angle does not."""
     numbers, three = np.arange(6.0).reshape(2, 3), np.array([3, 5], np.uint32)
-    some = run_tables.RunTable({"initial_rate": numbers}, None, None, None, 2)
+    some = run_tables.RunTable({"initial_rate": numbers}, 2)
     others = [
         dataclasses.replace(some, given={"initial_rate": np.nextafter(numbers, 9.0)}),
         dataclasses.replace(some, given={"disturbance_bias": numbers}),
-        dataclasses.replace(some, trial=three),
-        dataclasses.replace(some, seed=three),
+        dataclasses.replace(some, streams={"trial": three}),
+        dataclasses.replace(some, streams={"seed": three}),
         dataclasses.replace(some, given={}, count=3),
     ]
     assert len({one.checksum for one in (some, *others)}) == 6
-    assert dataclasses.replace(some, angle=np.ones(2)).checksum == some.checksum
+    assert dataclasses.replace(some, dependent={"initial_angle": np.ones(2)}).checksum == some.checksum
 
 
 @pytest.mark.parametrize("folder", ["tables[1]", "tables*"])

@@ -134,7 +134,7 @@ BROKEN = [
         frame(n=pl.Series([None] * ROWS, dtype=pl.Float64)),
         "has no number in the column n",
     ),
-    ({}, frame(measured_age=np.full(ROWS, -1.0)), "has measured_age -1.0 in row 0, but must have an age of at least 0"),
+    ({}, frame(measured_age=np.full(ROWS, -1.0)), "has measured_age -1 in row 0, but must have an age of at least 0"),
 ]
 
 

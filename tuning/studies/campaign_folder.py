@@ -399,7 +399,7 @@ def simulate(
         finished_parts = simulate_remotely(folder, blocks)
     else:
         finished_parts = running.make_parts(folder.campaign.simulate, folder.rows, blocks)
-    running.report_progress(finished_parts, running.count_progress(running.kept_parts(parts, blocks), trials), report)
+    running.report_progress(finished_parts, running.count_progress(parts, trials, blocks), report)
     if is_only_writer:
         folder.rows.tidy(folder.rows.parts()[0])
 
@@ -410,8 +410,7 @@ def write_run_table(folder: Folder, report: Callable[[Tally], None]) -> None:
     folder.dry_run_rows.tidy(parts)
     blocks = running.missing_parts(parts, folder.trials)
     finished_parts = running.make_parts(folder.campaign.draw, folder.dry_run_rows, blocks)
-    done = sum(part.count for part in running.kept_parts(parts, blocks))
-    running.report_progress(finished_parts, Tally(done, folder.trials, 0), report)
+    running.report_progress(finished_parts, running.count_progress(parts, folder.trials, blocks), report)
 
 
 def write_trial_count(folder: Folder, trials: int) -> Folder:
