@@ -140,14 +140,6 @@ def test_repeated_part_is_not_counted_twice_in_the_progress(command, monkeypatch
     assert [(tally.done, tally.total) for tally in standing] == [(0, 10), (10, 10), (0, 20), (20, 20)]
 
 
-def test_repeated_command_simulates_no_trials(command, simulated):
-    files = {path: path.stat().st_mtime_ns for path in (simulated / "trials").iterdir()}
-    code, said, _ = command("montecarlo", "s.toml", "--trials", 250, "--seed", 3, "--no-figures")
-    assert code == 0
-    assert "250 ok" in said
-    assert {path: path.stat().st_mtime_ns for path in (simulated / "trials").iterdir()} == files
-
-
 @pytest.mark.parametrize(
     ("change", "said"),
     [
