@@ -49,7 +49,10 @@ def print_table(content: Table) -> None:
     from rich.text import Text as RichText
 
     rich_table = RichTable(pad_edge=False, box=None)
-    widths = [max((_smallest_width(row[k]) for row in content.rows), default=1) for k in range(len(content.head))]
+    widths = [
+        max(1, *map(len, name.split()), *(_smallest_width(row[k]) for row in content.rows))
+        for k, name in enumerate(content.head)
+    ]
     for name, width in zip(content.head, widths, strict=True):
         rich_table.add_column(escape(name), min_width=width)
     for row in content.rows:
