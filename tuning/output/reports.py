@@ -115,8 +115,9 @@ def identify_report(summary: Mapping[str, Any]) -> Report:
 
 def _design_report(summary: Mapping[str, Any]) -> Report:
     """Return the report of `ptsmc identify --design`."""
+    columns = ("value", "expected_std", "plain_std")  # a 1 sigma may be infinite, None in the file
     rows = [
-        (one["parameter"], *(f"{one[key]:.3g}" for key in ("value", "expected_std", "plain_std")), one["unit"])
+        (one["parameter"], *(format_number(one[key], ".3g", "none") for key in columns), one["unit"])
         for one in summary["parameters"]
     ]
     table = Table(
