@@ -26,7 +26,6 @@ from tuning.output import (
     page_charts,
     reports,
     summaries,
-    trials_report,
     tune_report,
 )
 from tuning.output.report import Report, Table
@@ -359,7 +358,7 @@ def why(*rows: dict[str, Any], **changes: Any) -> Iterable[str]:
     """Return the reasons of a trial. Each row is an input, in which a category has a fraction of equal trials."""
     alike = {"metric": "effort", "trial": 3, "value": None, "drawn": 2.0, "unit": "", "fraction": None, "median": 1.0,
              "percentile": None, "rank_correlation": None, "first_order": None, **changes}  # fmt: skip
-    return trials_report.explanation_lines([{**alike, **row} for row in rows], "spacecraft")
+    return campaign_report.explanation_lines([{**alike, **row} for row in rows], "spacecraft")
 
 
 OTHERS: dict[str, Callable[[], Any]] = {
@@ -378,7 +377,7 @@ OTHERS: dict[str, Callable[[], Any]] = {
     ),
     # its class may have another unit than a built-in k
     "gains of a custom law": lambda: campaign_gains(controller={"kind": "custom", "t_f": 30.0, "k": 2.0}),
-    "how to replay a trial": lambda: trials_report.replay_hint(
+    "how to replay a trial": lambda: campaign_report.replay_hint(
         pl.DataFrame({"trial": [7], "window_error": [0.1]}), Path("my out"), is_custom=True
     ),
     "best pair of a map": lambda: pairs(4),

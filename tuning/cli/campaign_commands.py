@@ -25,7 +25,7 @@ from tuning.cli.options import (
     whole_number,
 )
 from tuning.errors import UsageError
-from tuning.output import terminal, trials_report
+from tuning.output import terminal
 from tuning.output.progress import CampaignProgress, Progress
 
 if TYPE_CHECKING:
@@ -252,6 +252,7 @@ def worst(
     _configure_jax(folder)
     from ptsmc_jax import scenario as scenarios
     from ptsmc_jax.campaigns import store
+    from tuning.output import campaign_report
     from tuning.studies import campaign_folder, campaign_summary, reasons
 
     campaign = campaign_folder.open_folder(folder)
@@ -264,9 +265,9 @@ def worst(
         store.write_csv(folder / "why.csv", list(inputs[0]) if inputs else [], [list(row.values()) for row in inputs])
     if not quiet:
         plant = campaign.scenario.plant.kind
-        terminal.print_table(trials_report.worst_trial_table(frame, by, plant))
-        terminal.print_lines(trials_report.replay_hint(frame, folder, is_custom=bool(campaign.custom_code)))
-        terminal.print_lines(*trials_report.explanation_lines(inputs, plant))
+        terminal.print_table(campaign_report.worst_trial_table(frame, by, plant))
+        terminal.print_lines(campaign_report.replay_hint(frame, folder, is_custom=bool(campaign.custom_code)))
+        terminal.print_lines(*campaign_report.explanation_lines(inputs, plant))
     return 0
 
 
@@ -288,6 +289,7 @@ def replay(
     """
     _configure_jax(folder)
     from ptsmc_jax.campaigns import store
+    from tuning.output import campaign_report
     from tuning.search import custom_parts
     from tuning.studies import campaign_folder, campaign_summary, single
 
@@ -309,7 +311,7 @@ def replay(
         summary = single.summary(repeated.run, campaign.scenario, campaign.computer)
         terminal.print_result("simulate", summary, campaign.scenario.plant.kind, replay_folder)
         terminal.print_lines(
-            *trials_report.replay_lines(repeated.difference, repeated.rounding, campaign_summary.TOLERANCE)
+            *campaign_report.replay_lines(repeated.difference, repeated.rounding, campaign_summary.TOLERANCE)
         )
     return 0 if repeated.difference is None or repeated.difference <= campaign_summary.TOLERANCE else 1
 
