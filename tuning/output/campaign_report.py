@@ -79,8 +79,8 @@ def count_lines(summary: Campaign) -> Iterator[str]:
     source = f"the run table {summary.run_table} and seed" if summary.run_table else "seed"
     yield f"{format_count(summary.simulated, 'trial')} of {source} {summary.seed}: {list_counts(summary.counts)}"
     for reason in summary.reasons:
-        first_time = "" if reason.first_bad_time is None else f", the first at {reason.first_bad_time:.4g} s"
-        yield f"  {reason.trials} {reason.status}: {reason.reason}{first_time}"
+        first_time = "" if reason["first_bad_time"] is None else f", the first at {reason['first_bad_time']:.4g} s"
+        yield f"  {reason['trials']} {reason['status']}: {reason['reason']}{first_time}"
     numbers = [
         f"{count['samples']} {status} in {format_count(count['trials'], 'trial')}"
         for status, count in summary.controller_samples.items()

@@ -48,9 +48,9 @@ def _error_column(name: str, change: str) -> Value:
     return Value(
         name,
         "arcsec",
-        lambda law: _to_arcsec(law.model_errors[change].window_error) if change in law.model_errors else None,
+        lambda law: _to_arcsec(law.model_errors[change]["window_error"]) if change in law.model_errors else None,
         interval=lambda law: (
-            _to_arcsec(law.model_errors[change].window_error_interval) if change in law.model_errors else None
+            _to_arcsec(law.model_errors[change]["window_error_interval"]) if change in law.model_errors else None
         ),
     )
 
@@ -250,8 +250,8 @@ def gain_lines(summary: Compare) -> Iterator[str]:
             yield f"  {sum(failures.values())} of {summary.trials} trials fail: {list_counts(failures)}"
         yield from (f"  {verdict}" for verdict in law.verdicts if not verdict.met)
         for change, results in law.model_errors.items():
-            if results.failures:
-                yield f"  {results.failures} of {summary.trials} trials fail with {CHANGES[change]}"
+            if results["failures"]:
+                yield f"  {results['failures']} of {summary.trials} trials fail with {CHANGES[change]}"
     yield f"a trial has settled when its angle stays below {summary.settling_angle:g} rad"
 
 

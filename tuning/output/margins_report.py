@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from ptsmc_jax.simulation.catalogues import MARGINS
 from tuning.output.formats import format_number
 from tuning.output.report import Report, Section, Table
-from tuning.output.summaries import LimitCycle, Margins, Numbers, SmallestMargins
+from tuning.output.summaries import Margins, Numbers, Row, SmallestMargins
 
 USUAL_MARGINS = {"gain_margin": 6.0, "phase_margin": 30.0}  # usual requirements [dB, deg]
 PHASES = {"hold": "hold phase", "before": "approach phase"}
@@ -20,7 +20,7 @@ COLUMNS = {
 
 def build(summary: Margins) -> Report:
     """Return the report of `ptsmc margins`."""
-    unstable = any(loop.judged and not loop.stable for loop in summary.before)
+    unstable = any(loop["judged"] and not loop["stable"] for loop in summary.before)
     if summary.open:
         headline, mood = "The nominal loop is open in the hold phase", "bad"
     elif not summary.stable:
@@ -65,7 +65,7 @@ def _condition_lines(summary: Margins) -> Iterator[str]:
     for judged, caveat in (
         (True, ""), (False, "; there the gains change too fast for frozen gains to mean much"),
     ):  # fmt: skip
-        times = sorted(loop.time_to_go for loop in summary.before if not loop.stable and loop.judged == judged)
+        times = sorted(loop["time_to_go"] for loop in summary.before if not loop["stable"] and loop["judged"] == judged)
         if times:
             yield f"in the approach phase, the loop with frozen gains is unstable at {_format_times(times)}{caveat}"
     yield from _open_loop_lines(summary)
@@ -81,7 +81,8 @@ def _open_loop_lines(summary: Margins) -> Iterator[str]:
     ):
         places = {"in the hold phase": [name for name in summary.open if (name in summary.cut) == by_limit]}
         loops = {
-            loop.time_to_go: [name for name in loop.open if (name in loop.cut) == by_limit] for loop in summary.before
+            loop["time_to_go"]: [name for name in loop["open"] if (name in loop["cut"]) == by_limit]
+            for loop in summary.before
         }
         times = sorted(time for time, names in loops.items() if names)
         if times:
@@ -135,12 +136,12 @@ def tuned_margin_lines(margins: Mapping[str, SmallestMargins] | None, *, require
         yield f"for larger margins, tune with {advice}; ptsmc pareto --against margins shows their cost"
 
 
-def limit_cycle_lines(limit_cycle: LimitCycle) -> Iterator[str]:
+def limit_cycle_lines(limit_cycle: Row) -> Iterator[str]:
     """Return the description of a limit cycle in the hold phase."""
     yield "the nominal run does NOT come to rest in the hold phase, so its margins count as zero"
     yield (
-        f"without noise and disturbance its command oscillates by {limit_cycle.size:.3g} {limit_cycle.unit} every "
-        f"{limit_cycle.periods:.3g} control periods; the boundary layer is too thin, or the gains are at "
+        f"without noise and disturbance its command oscillates by {limit_cycle['size']:.3g} {limit_cycle['unit']} "
+        f"every {limit_cycle['periods']:.3g} control periods; the boundary layer is too thin, or the gains are at "
         "the stability limit"
     )
 

@@ -15,6 +15,7 @@ from ptsmc_jax.simulation.requirements import Verdict
 Number = float | None
 Numbers = dict[str, Number]
 Interval = tuple[float, float] | None
+Row = dict[str, Any]  # the fields of a dataclass in the module that wrote the summary
 T = TypeVar("T")
 
 
@@ -83,36 +84,6 @@ class Group(msgspec.Struct, frozen=True):
         return None if statistics is None else getattr(statistics, statistic)
 
 
-class Earlier(msgspec.Struct, frozen=True):
-    """A search whose gains broke a limit on held-out trials."""
-
-    held_out_seed: int
-    margins: dict[str, float]
-    over: dict[str, float]
-
-
-class Confirmed(msgspec.Struct, frozen=True):
-    """The confirmation of a requirement on a fraction of the trials."""
-
-    metric: str
-    confirmed: bool
-    trials: int
-    violations: int
-    allowed: int | None
-    probability: float
-
-
-class Hardest(msgspec.Struct, frozen=True):
-    """The worst trial that the search found inside the support of the dispersions."""
-
-    metric: str
-    ratio: Number
-    unbounded: bool
-    breaks_limit: bool
-    moved: list[str]
-    status: str
-
-
 class Search(msgspec.Struct, frozen=True, kw_only=True):
     """The course and the outcome of a search for gains."""
 
@@ -120,22 +91,14 @@ class Search(msgspec.Struct, frozen=True, kw_only=True):
     conflict: Numbers | None
     searched_globally: bool
     margins: dict[str, float]
-    earlier: list[Earlier]
-    confirmed: list[Confirmed]
-    hardest: Hardest | None
+    earlier: list[Row]  # of `tuner.RejectedSearch`
+    confirmed: list[Row]  # of `confirm.Count`
+    hardest: Row | None  # of `worst.Hardest`
     worst_case: bool
     averaged: int
     rollouts: int
     gradients: int
     seconds: float
-
-
-class LimitCycle(msgspec.Struct, frozen=True):
-    """A limit cycle in the hold phase."""
-
-    size: float
-    unit: str
-    periods: float
 
 
 class SmallestMargins(msgspec.Struct, frozen=True):
@@ -146,7 +109,7 @@ class SmallestMargins(msgspec.Struct, frozen=True):
     phase_margin: Number
     delay_margin: Number
     peak_sensitivity: Number
-    limit_cycle: LimitCycle | None = None
+    limit_cycle: Row | None = None  # of `limit_cycles.LimitCycle`, with the unit of its size
 
     @property
     def numbers(self) -> Numbers:
@@ -160,25 +123,6 @@ class Trust(msgspec.Struct, frozen=True):
     influence: dict[str, str]
     margins: dict[str, SmallestMargins] | None
     gradient_error: Numbers | None
-
-
-class Check(msgspec.Struct, frozen=True):
-    """The result of differential evolution, which checks the local searches of a tuning."""
-
-    value: float
-    distance: float
-    kept: bool
-    rollouts: int
-
-
-class ShortestTime(msgspec.Struct, frozen=True):
-    """The shortest t_f [s] that a limit on the torque allows, by theory and by simulation."""
-
-    limit: float
-    theory: Number
-    simulated: Number
-    quantile: Number
-    unit: str | None
 
 
 class Tune(msgspec.Struct, frozen=True, kw_only=True):
@@ -197,22 +141,14 @@ class Tune(msgspec.Struct, frozen=True, kw_only=True):
     before: Group | None = None
     published_unavailable: str | None
     published_label: str
-    shortest_t_f: ShortestTime | None
+    shortest_t_f: Row | None  # of `design.ShortestTime`
     broken_by: dict[str, list[str]]
     verdicts: list[Entry]
     judged_on: str
     warnings: list[str]
     search: Search
     trust: Trust | None
-    differential_evolution: Check | None
-
-
-class Changed(msgspec.Struct, frozen=True):
-    """The errors of a law under an inertia or a delay that it does not know."""
-
-    window_error: Number
-    window_error_interval: Interval
-    failures: int
+    differential_evolution: Row | None  # of `global_check.Check`
 
 
 class Law(msgspec.Struct, frozen=True, kw_only=True):
@@ -233,7 +169,7 @@ class Law(msgspec.Struct, frozen=True, kw_only=True):
     settling_time: Numbers | None
     settling_near_far: tuple[Number, Number] | None
     margins: dict[str, SmallestMargins] | None
-    model_errors: dict[str, Changed]
+    model_errors: dict[str, Row]  # errors under an inertia or a delay that the law does not know
     verdicts: list[Entry]
 
 
@@ -270,15 +206,6 @@ class Quantiles(msgspec.Struct, frozen=True):
     min: Number = None
 
 
-class Reason(msgspec.Struct, frozen=True):
-    """A status and reason of failure, and the number of trials that failed for it."""
-
-    status: str
-    reason: str
-    trials: int
-    first_bad_time: Number
-
-
 class Pointing(msgspec.Struct, frozen=True):
     """The pointing budget of a campaign."""
 
@@ -301,7 +228,7 @@ class Campaign(msgspec.Struct, frozen=True, kw_only=True):
     simulated: int
     unjudged: list[str]
     counts: dict[str, int]
-    reasons: list[Reason]
+    reasons: list[Row]  # status and reason of failure, number of trials, and time of the first failure
     lower_bound: Number
     verdicts: list[Entry]
     quantiles: dict[str, Quantiles]
@@ -310,16 +237,6 @@ class Campaign(msgspec.Struct, frozen=True, kw_only=True):
     controller_samples: dict[str, dict[str, int]] = {}  # status -> number of samples, and of trials with such a sample
     pointing: Pointing | None = None
     warnings: list[str]
-
-
-class Frozen(msgspec.Struct, frozen=True):
-    """The stability of the loop at a sample before the hand-over, with the gains frozen."""
-
-    time_to_go: float
-    judged: bool
-    stable: bool
-    open: list[str]
-    cut: list[str]
 
 
 class Margins(msgspec.Struct, frozen=True, kw_only=True):
@@ -332,12 +249,12 @@ class Margins(msgspec.Struct, frozen=True, kw_only=True):
     hold: dict[str, Numbers]
     together: Numbers
     sensors: dict[str, Numbers]
-    before: list[Frozen]
+    before: list[Row]  # stability at samples before the hand-over, with the gains frozen
     not_converged: bool = False
     dispersed: int | None = None
     note: str | None
     start_deg: Number = None
-    limit_cycle: LimitCycle | None = None
+    limit_cycle: Row | None = None  # of `limit_cycles.LimitCycle`, with the unit of its size
 
 
 def read(kind: type[T], summary: Mapping[str, Any]) -> T:

@@ -17,7 +17,7 @@ from tuning.output.formats import (
     ratio_to_bound,
 )
 from tuning.output.report import Report, Section, Table, Text
-from tuning.output.summaries import Check, Entry, Group, Hardest, Search, Tune
+from tuning.output.summaries import Entry, Group, Row, Search, Tune
 
 GRADIENT_TOLERANCE = 0.01  # largest relative difference of gradients from finite differences
 HOPELESS = 1.1  # equal to `optimise.HOPELESS`, whose import takes a second: no confirmation above this metric / limit
@@ -152,11 +152,11 @@ def search_lines(summary: Tune) -> Iterator[str]:
     yield from _continuation_lines(record)
     yield from _confidence_lines(summary)
     for count in record.confirmed:
-        limit = "none allowed" if count.allowed is None else f"at most {count.allowed} allowed"
+        limit = "none allowed" if count["allowed"] is None else f"at most {count['allowed']} allowed"
         yield (
-            f"{count.metric} {'confirmed' if count.confirmed else 'NOT confirmed'} on {count.trials} other trials: "
-            f"{count.violations} beyond the limit, {limit}; probability that the held-out trials meet it: "
-            f"{percent(count.probability)} %"
+            f"{count['metric']} {'confirmed' if count['confirmed'] else 'NOT confirmed'} on {count['trials']} other "
+            f"trials: {count['violations']} beyond the limit, {limit}; probability that the held-out trials meet it: "
+            f"{percent(count['probability'])} %"
         )
     hopeless = [metric for metric, violation in violated.items() if violation is None or violation > HOPELESS]
     if hopeless and not record.confirmed and any(v.quantile is not None for v in summary.verdicts):
@@ -198,13 +198,13 @@ def _conflict_lines(summary: Tune) -> Iterator[str]:
 
 def _continuation_lines(record: Search) -> Iterator[str]:
     """Return the earlier searches, whose gains broke a limit on held-out trials."""
-    next_margins = [*(earlier.margins for earlier in record.earlier[1:]), record.margins]
+    next_margins = [*(earlier["margins"] for earlier in record.earlier[1:]), record.margins]
     for earlier, margins in zip(record.earlier, next_margins, strict=False):
-        for metric, reached in earlier.over.items():
+        for metric, reached in earlier["over"].items():
             yield (
                 f"earlier gains reached {_relative_to_limit(metric, reached):.4g} times the limit of {metric} on "
-                f"held-out trials (seed {earlier.held_out_seed}); the search continued with a reserve of "
-                f"{100 * margins[metric]:.2g} % instead of {100 * earlier.margins[metric]:.2g} %"
+                f"held-out trials (seed {earlier['held_out_seed']}); the search continued with a reserve of "
+                f"{100 * margins[metric]:.2g} % instead of {100 * earlier['margins'][metric]:.2g} %"
             )
 
 
@@ -223,25 +223,25 @@ def _confidence_lines(summary: Tune) -> Iterator[str]:
             )
 
 
-def _describe_worst_case(hardest: Hardest, *, tuned_for: bool) -> str:
+def _describe_worst_case(hardest: Row, *, tuned_for: bool) -> str:
     """Return the worst case inside the dispersions in words."""
     where = "in the worst case inside the dispersions"
-    if hardest.unbounded:
-        dispersions = " and ".join(name.replace("_", " ") for name in hardest.moved) or "the dispersions"
-        failure = {"singular": "reaches a singularity of the law"}.get(hardest.status, "diverges")
+    if hardest["unbounded"]:
+        dispersions = " and ".join(name.replace("_", " ") for name in hardest["moved"]) or "the dispersions"
+        failure = {"singular": "reaches a singularity of the law"}.get(hardest["status"], "diverges")
         return (
-            f"{where}, over {dispersions}, a trial {failure}: {hardest.metric} has no bound; require it for a "
-            f"fraction of the trials instead, {hardest.metric} = {{ limit = .., quantile = 0.99 }}"
+            f"{where}, over {dispersions}, a trial {failure}: {hardest['metric']} has no bound; require it for a "
+            f"fraction of the trials instead, {hardest['metric']} = {{ limit = .., quantile = 0.99 }}"
         )
-    ratio_text = "has no value" if hardest.ratio is None else f"is {hardest.ratio:.4g} times its limit"
-    advice = "" if tuned_for or not hardest.breaks_limit else "; tune.worst_case = true tunes for it"
-    return f"{where}, {hardest.metric} {ratio_text}{advice}"
+    ratio_text = "has no value" if hardest["ratio"] is None else f"is {hardest['ratio']:.4g} times its limit"
+    advice = "" if tuned_for or not hardest["breaks_limit"] else "; tune.worst_case = true tunes for it"
+    return f"{where}, {hardest['metric']} {ratio_text}{advice}"
 
 
-def _evolution_comparison(check: Check, record: Search) -> str:
+def _evolution_comparison(check: Row, record: Search) -> str:
     """Return the comparison of the tuned gains with the result of differential evolution in words."""
     keeps_limits = all(one is not None and one <= 1.0 for one in record.largest_over_limit.values())
-    log_ratio = check.distance  # difference of the logarithms of the objectives
+    log_ratio = check["distance"]  # difference of the logarithms of the objectives
     difference = (
         f"{math.exp(log_ratio):.3g} times"
         if log_ratio > math.log(2.0)
@@ -252,8 +252,10 @@ def _evolution_comparison(check: Check, record: Search) -> str:
         (True, False): "with gains that break a limit; the tuned gains keep every limit",
         (False, True): "with gains that keep every limit; the tuned gains break one",
         (False, False): "with gains that break a limit, as the tuned gains do",
-    }[keeps_limits, check.kept]
-    return f"differential evolution found an objective of {check.value:.4e} in {check.rollouts} trials: {comparison}"
+    }[keeps_limits, check["kept"]]
+    return (
+        f"differential evolution found an objective of {check['value']:.4e} in {check['rollouts']} trials: {comparison}"
+    )
 
 
 def _describe_violation(summary: Tune, metric: str, ratio: float | None) -> str:
@@ -365,14 +367,14 @@ def _shortest_time_lines(summary: Tune) -> Iterator[str]:
     """Return the shortest t_f that the limit on the torque allows."""
     shortest = summary.shortest_t_f
     # the theory ignores noise: without a simulation that keeps the limit its t_f would contradict the verdict
-    if shortest is None or (shortest.simulated is None and shortest.theory is not None):
+    if shortest is None or (shortest["simulated"] is None and shortest["theory"] is not None):
         return
-    fraction = "" if shortest.quantile is None else f" in {100 * shortest.quantile:g} % of trials"
-    limit = f"peak_torque below {shortest.limit:g} {shortest.unit or ''}".rstrip() + fraction
-    if shortest.theory is None:
+    fraction = "" if shortest["quantile"] is None else f" in {100 * shortest['quantile']:g} % of trials"
+    limit = f"peak_torque below {shortest['limit']:g} {shortest['unit'] or ''}".rstrip() + fraction
+    if shortest["theory"] is None:
         yield f"the tuned gains keep {limit} at no t_f, by theory"
     else:
         yield (
-            f"the tuned gains keep {limit} from t_f = {format_number(shortest.simulated, '.4g')} s on "
-            f"({shortest.theory:.4g} s by theory)"
+            f"the tuned gains keep {limit} from t_f = {format_number(shortest['simulated'], '.4g')} s on "
+            f"({shortest['theory']:.4g} s by theory)"
         )
