@@ -13,7 +13,7 @@ from ptsmc_jax.simulation.requirements import fewest_trials
 from tuning.output import report
 from tuning.output.formats import add_unit, format_angle, format_count, format_named_error, format_number, list_counts
 from tuning.output.report import Block, Report, Section, Table, Text
-from tuning.output.summaries import Campaign, Entry, Pointing
+from tuning.output.summaries import Campaign, Entry, Row
 
 if TYPE_CHECKING:
     import polars as pl
@@ -104,9 +104,9 @@ def quantile_tables(summary: Campaign) -> list[Table]:
                 continue
             has_missing_values = quantiles.without_value > failed  # for example of runs that end but never settle
             numbers = (
-                format_number(quantiles.median.value, ".3g"),
-                format_number(tail.value, ".3g"),
-                f"{format_number(tail.low, '.3g')}..{format_number(tail.high, '.3g')}",
+                format_number(quantiles.median["value"], ".3g"),
+                format_number(tail["value"], ".3g"),
+                "..".join(format_number(tail[end], ".3g") for end in ("low", "high")),
                 "none" if has_missing_values else format_number(getattr(quantiles, worst), ".3g"),
             )
             rows.append((name, *numbers, units.get(name, "")))
@@ -162,16 +162,16 @@ def _is_pointing_index(metric: str) -> bool:
     return index in INDICES and axis in AXES
 
 
-def budget_lines(summary: Campaign, pointing: Pointing) -> Iterator[str]:
+def budget_lines(summary: Campaign, pointing: Row) -> Iterator[str]:
     """Return the probability and the confidence of the pointing budget, and the reason for missing values."""
-    boresight = ", ".join(f"{v:g}" for v in pointing.boresight)
-    begins = f"{pointing.after:g} s after t_f" if pointing.after else "t_f"
+    boresight = ", ".join(f"{v:g}" for v in pointing["boresight"])
+    begins = f"{pointing['after']:g} s after t_f" if pointing["after"] else "t_f"
     yield (
-        f"{100 * pointing.probability:g} % of the runs stay within the angles of this budget from {begins} to t_end, "
-        f"with {100 * pointing.confidence:g} % confidence; boresight {boresight}"
+        f"{100 * pointing['probability']:g} % of the runs stay within the angles of this budget from {begins} to "
+        f"t_end, with {100 * pointing['confidence']:g} % confidence; boresight {boresight}"
     )
-    if any(value is None for axes in pointing.budget.values() for value in axes.values()):
-        few, many = (fewest_trials(pointing.probability, confidence) for confidence in REVIEW_CONFIDENCES)
+    if any(value is None for axes in pointing["budget"].values() for value in axes.values()):
+        few, many = (fewest_trials(pointing["probability"], confidence) for confidence in REVIEW_CONFIDENCES)
         # runs that ended early have no angles
         ended_early = summary.simulated - summary.counts["ok"] - summary.counts.get("not_converged", 0)
         if summary.simulated >= many and ended_early:
@@ -180,12 +180,12 @@ def budget_lines(summary: Campaign, pointing: Pointing) -> Iterator[str]:
             yield f"an angle is - without {many} runs that all reach their end ({few} for 90 % confidence)"
 
 
-def budget_table(pointing: Pointing) -> Table:
+def budget_table(pointing: Row) -> Table:
     """Return the angles of each index about the axes and as a half-cone."""
     rows = []
-    for index, angles in pointing.budget.items():
+    for index, angles in pointing["budget"].items():
         name, _, meaning = INDICES[index].partition(", ")
-        meaning_text = f"{meaning} ({pointing.window:g} s)" if "window" in meaning else meaning
+        meaning_text = f"{meaning} ({pointing['window']:g} s)" if "window" in meaning else meaning
         rows.append((name, *(format_angle(angles.get(axis)) for axis in AXES), meaning_text))
     return Table(("index", "x", "y", "z", "half-cone", "largest in the observation of"), rows)
 

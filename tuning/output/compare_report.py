@@ -68,7 +68,7 @@ def _margin_column(name: str) -> Value:
             return math.inf if verdict.worst is None and not verdict.failures else verdict.worst
         if law.margins is None or "hold" not in law.margins:
             return None
-        margin = law.margins["hold"].numbers[name]
+        margin = law.margins["hold"][name]
         return math.inf if margin is None else margin  # null means that the margin is unlimited
 
     return Value(name.removesuffix("_margin").replace("_", " "), MARGINS[name].unit, read_margin_of_law)

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from ptsmc_jax.simulation.catalogues import MARGINS
 from tuning.output.formats import format_number
 from tuning.output.report import Report, Section, Table
-from tuning.output.summaries import Margins, Numbers, Row, SmallestMargins
+from tuning.output.summaries import Margins, Numbers, Row
 
 USUAL_MARGINS = {"gain_margin": 6.0, "phase_margin": 30.0}  # usual requirements [dB, deg]
 PHASES = {"hold": "hold phase", "before": "approach phase"}
@@ -102,7 +102,7 @@ def _format_times(times: list[float]) -> str:
     return f"{span} s to go"
 
 
-def tuned_margin_lines(margins: Mapping[str, SmallestMargins] | None, *, required: bool) -> Iterator[str]:
+def tuned_margin_lines(margins: Mapping[str, Row] | None, *, required: bool) -> Iterator[str]:
     """Return the margins of tuned gains, and a warning if they are smaller than usual.
 
     Args:
@@ -114,23 +114,22 @@ def tuned_margin_lines(margins: Mapping[str, SmallestMargins] | None, *, require
         smallest = (margins or {}).get(phase_key)
         if smallest is None:
             continue
-        if smallest.limit_cycle is not None or not smallest.stable:
+        if smallest.get("limit_cycle") is not None:
             is_insufficient = True
-            yield from (
-                limit_cycle_lines(smallest.limit_cycle)
-                if smallest.limit_cycle
-                else [f"the nominal loop is NOT stable in the {phase}"]
-            )
-            continue
-        yield f"margins of the nominal loop in the {phase}: {format_margins(smallest.numbers)}"
-        missed = [
-            f"{usual:g} {MARGINS[name].unit} of {_short_name(name)}"
-            for name, usual in USUAL_MARGINS.items()
-            if (value := smallest.numbers[name]) is not None and value < usual
-        ]
-        if missed:
+            yield from limit_cycle_lines(smallest["limit_cycle"])
+        elif not smallest["stable"]:
             is_insufficient = True
-            yield f"less than {' and '.join(missed)} in the {phase}: errors of the model may make the loop unstable"
+            yield f"the nominal loop is NOT stable in the {phase}"
+        else:
+            yield f"margins of the nominal loop in the {phase}: {format_margins(smallest)}"
+            missed = [
+                f"{usual:g} {MARGINS[name].unit} of {_short_name(name)}"
+                for name, usual in USUAL_MARGINS.items()
+                if smallest[name] is not None and smallest[name] < usual
+            ]
+            if missed:
+                is_insufficient = True
+                yield f"less than {' and '.join(missed)} in the {phase}: errors of the model may make the loop unstable"
     if is_insufficient and not required:
         advice = " and ".join(f"requirements.{name} = {usual:g}" for name, usual in USUAL_MARGINS.items())
         yield f"for larger margins, tune with {advice}; ptsmc pareto --against margins shows their cost"

@@ -60,28 +60,19 @@ class Run(msgspec.Struct, frozen=True, kw_only=True):
     controller_statuses: dict[str, int] = {}
 
 
-class Statistics(msgspec.Struct, frozen=True):
-    """Statistics of a metric over the trials that reached their end."""
-
-    mean: Number
-    rms: Number
-    max: Number
-    rms_interval: Interval = None
-
-
 class Group(msgspec.Struct, frozen=True):
     """A set of gains, and the results of its trials."""
 
     trials: int
     counts: dict[str, int]
-    metrics: dict[str, Statistics | None]
+    metrics: dict[str, Row | None]  # statistics over the trials that reached their end
     gains: dict[str, float] = {}
     lower_bound: Number = None
 
     def number(self, metric: str, statistic: str) -> Number:
         """Return a statistic of a metric; None if no trial has the metric."""
         statistics = self.metrics.get(metric)
-        return None if statistics is None else getattr(statistics, statistic)
+        return None if statistics is None else statistics[statistic]
 
 
 class Search(msgspec.Struct, frozen=True, kw_only=True):
@@ -101,27 +92,11 @@ class Search(msgspec.Struct, frozen=True, kw_only=True):
     seconds: float
 
 
-class SmallestMargins(msgspec.Struct, frozen=True):
-    """The smallest margins of a phase of the nominal loop; None: unlimited."""
-
-    stable: bool
-    gain_margin: Number
-    phase_margin: Number
-    delay_margin: Number
-    peak_sensitivity: Number
-    limit_cycle: Row | None = None  # of `limit_cycles.LimitCycle`, with the unit of its size
-
-    @property
-    def numbers(self) -> Numbers:
-        """Return the margins by name."""
-        return {name: getattr(self, name) for name in MARGINS}
-
-
 class Trust(msgspec.Struct, frozen=True):
     """The diagnostics of a tuning result."""
 
     influence: dict[str, str]
-    margins: dict[str, SmallestMargins] | None
+    margins: dict[str, Row] | None  # by phase, see `stability.worst_margins`
     gradient_error: Numbers | None
 
 
@@ -168,7 +143,7 @@ class Law(msgspec.Struct, frozen=True, kw_only=True):
     unsettled: int
     settling_time: Numbers | None
     settling_near_far: tuple[Number, Number] | None
-    margins: dict[str, SmallestMargins] | None
+    margins: dict[str, Row] | None  # by phase, see `stability.worst_margins`
     model_errors: dict[str, Row]  # errors under an inertia or a delay that the law does not know
     verdicts: list[Entry]
 
@@ -186,35 +161,16 @@ class Compare(msgspec.Struct, frozen=True):
     warnings: list[str]
 
 
-class Quantile(msgspec.Struct, frozen=True):
-    """A quantile of a metric and its confidence interval."""
-
-    value: Number
-    low: Number
-    high: Number
-
-
 class Quantiles(msgspec.Struct, frozen=True):
-    """Quantiles and other statistics of a metric over the trials of a campaign."""
+    """Quantiles, their intervals and other statistics of a metric over the trials of a campaign."""
 
     without_value: int
-    median: Quantile = msgspec.field(name="0.5")
-    high: Quantile | None = msgspec.field(name="0.9973", default=None)
-    low: Quantile | None = msgspec.field(name="0.0027", default=None)  # only for a metric that is better when larger
+    median: Numbers = msgspec.field(name="0.5")
+    high: Numbers | None = msgspec.field(name="0.9973", default=None)
+    low: Numbers | None = msgspec.field(name="0.0027", default=None)  # only for a metric that is better when larger
     rms: Number = None
     max: Number = None
     min: Number = None
-
-
-class Pointing(msgspec.Struct, frozen=True):
-    """The pointing budget of a campaign."""
-
-    boresight: list[float]
-    window: float
-    after: float
-    probability: float
-    confidence: float
-    budget: dict[str, Numbers]
 
 
 class Campaign(msgspec.Struct, frozen=True, kw_only=True):
@@ -235,7 +191,7 @@ class Campaign(msgspec.Struct, frozen=True, kw_only=True):
     drivers: dict[str, dict[str, Numbers]]  # metric -> input -> sensitivities, see `statistics.drivers`
     driver_trials: dict[str, int]
     controller_samples: dict[str, dict[str, int]] = {}  # status -> number of samples, and of trials with such a sample
-    pointing: Pointing | None = None
+    pointing: Row | None = None  # the budget, and what it is made for
     warnings: list[str]
 
 

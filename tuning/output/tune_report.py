@@ -92,17 +92,17 @@ def accuracy_lines(summary: Tune) -> Iterator[str]:
         yield f"{count} of {held_out.trials} held-out trials fail with the tuned gains: {list_counts(failures)}"
     for name, group in (("held-out", held_out), ("training", summary.training)):
         statistics = group.metrics.get("window_error")
-        if statistics is not None and statistics.rms is not None:
-            ratio, bound = ratio_to_bound(statistics.rms, group.lower_bound), format_error(group.lower_bound, plant)
+        if statistics is not None and statistics["rms"] is not None:
+            ratio, bound = ratio_to_bound(statistics["rms"], group.lower_bound), format_error(group.lower_bound, plant)
             compared = "" if ratio is None else f", {format_ratio(ratio)} times the lower bound of {bound}"
-            spread = format_interval(statistics.rms_interval, lambda value: format_error(value, plant))
-            yield f"{name} trials: {format_error(statistics.rms, plant)}{spread}{compared}"
+            spread = format_interval(statistics.get("rms_interval"), lambda value: format_error(value, plant))
+            yield f"{name} trials: {format_error(statistics['rms'], plant)}{spread}{compared}"
     yield from _published_comparison(summary)
     if summary.gains:
         yield f"tuned gains: {', '.join(f'{name} {value:.6g}' for name, value in summary.gains.items())}"
     saturated = held_out.metrics.get("saturated")
-    if saturated and saturated.max and saturated.mean is not None:
-        saturation = f"{percent(saturated.mean)} % of a trial on average, {percent(saturated.max)} % at most"
+    if saturated and saturated["max"] and saturated["mean"] is not None:
+        saturation = f"{percent(saturated['mean'])} % of a trial on average, {percent(saturated['max'])} % at most"
         yield f"the actuators saturate with the tuned gains: {saturation}"
     before = None if summary.before is None else summary.before.number("window_error", "rms")
     after = held_out.number("window_error", "rms")
@@ -295,7 +295,7 @@ def advice_lines(summary: Tune) -> Iterator[str]:
                 f"limit: tune with {more_trials} or {stricter}"
             )
     trained, held_out = (
-        one.rms_interval if one else None
+        one.get("rms_interval") if one else None
         for one in (summary.training.metrics.get("window_error"), summary.held_out.metrics.get("window_error"))
     )
     if trained and held_out and trained[1] < held_out[0]:
