@@ -384,16 +384,12 @@ def _add_observer_stage(computer: Board, observer: Observer, device: Actuators) 
 
 def _add_law_stage(computer: Board, law: Law, observer: Observer, command_filter: CommandFilter | None) -> None:
     """Add a stage that evaluates the law, before and after its hand-over, and filters its command."""
-    m, memory = observer.model.inputs, law.begin()
-    x = computer.model.state_of(computer.state)
+    m, x = observer.model.inputs, computer.model.state_of(computer.state)
     target = jax.eval_shape(computer.parameters["reference"], real())
-
-    def evaluate_once(law: Law, x: Any, target: Any) -> Any:
-        now = Sample(jnp.zeros(()), jnp.zeros((), bool), jnp.ones(()), memory)
-        return law(now, x, target, jnp.zeros(m), jnp.zeros(()))[1]
-
+    now = Sample(jnp.zeros(()), jnp.zeros((), bool), jnp.ones(()), law.begin())
+    _, s, _ = jax.eval_shape(lambda *arguments: law(*arguments), now, x, target, jnp.zeros(m), jnp.zeros(()))
     computer.state["law"] = jax.eval_shape(law.begin)
-    computer.outputs |= {"command": real(m), "s": real(*jax.eval_shape(evaluate_once, law, x, target).shape)}
+    computer.outputs |= {"command": real(m), "s": real(*s.shape)}
     filter_note = "" if command_filter is None else ", after the command filter"
     computer.meanings |= {
         "law": "memory of the law",

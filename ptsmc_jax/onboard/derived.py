@@ -23,15 +23,11 @@ Rule = Callable[[Values], Values]  # maps all parameters to all parameters, with
 
 def rules(parts: Parts) -> list[Rule]:
     """Return the rules for the flight computer of these parts; each uses the result of the rule before it."""
-    rules_in_order: list[Rule] = [_derive_inertia_inverses, _derive_observer_values]
     estimator = getattr(parts.sensors, "filter", None)
-    if isinstance(estimator, KalmanFilter):
-        rules_in_order.append(_copy_period)
-    elif estimator is not None:
-        rules_in_order.append(_filter_gain_rule(parts.sensors))
-    if parts.actuators.wheels is not None:
-        rules_in_order.append(_derive_wheel_allocation)
-    return rules_in_order
+    filter_rules: list[Rule] = []
+    if estimator is not None:
+        filter_rules = [_copy_period if isinstance(estimator, KalmanFilter) else _filter_gain_rule(parts.sensors)]
+    return [_derive_inertia_inverses, _derive_observer_values, *filter_rules, _derive_wheel_allocation]
 
 
 def _with_inertia_inverse(model: Any) -> Any:

@@ -44,7 +44,7 @@ class Node:
         self.finite = self._is_finite()
         self.title: Title | None = None  # name of the value in the source
         self.indices = ""  # indices of the component within this value
-        self.section: Any = None  # function of the source that computes the value
+        self.section = ""  # heading of the function of the source that computes the value
 
     def _is_finite(self) -> bool:
         """Return whether the value is always finite, so that its product with 0 is 0 and not NaN.
@@ -124,7 +124,7 @@ class Pool:
 
     def __init__(self) -> None:
         self.block = self.outermost = Block()
-        self.section: Any = None
+        self.section = ""
 
     def constant(self, value: Any, kind: str) -> Node:
         """Return the node of a constant."""

@@ -36,21 +36,14 @@ class Controller:
         self.board: Board = build_board(self.ready.parts, reference_input)
         self.code: Code = generate(self.board)
         law, device = self.ready.parts.controller, self.ready.parts.actuators
+        self.period = float(self.ready.parts.period)  # control period [s]
+        # the smallest possible time to go at the last sample before the hand-over [s]
+        self.last_time_to_go = float(law.delta) + self.period
         self.info = ExportInfo(
             name, source, checksum(self.scenario), type(law).__qualname__, self.board.parameters["filter"] is not None,
             self.board.model.largest_measurement,
             device.delay, float((law.t_f / self.last_time_to_go) ** 2),
         )  # fmt: skip
-
-    @property
-    def period(self) -> float:
-        """The control period [s]."""
-        return float(self.ready.parts.period)
-
-    @property
-    def last_time_to_go(self) -> float:
-        """The smallest possible time to go at the last sample before the hand-over [s]."""
-        return float(self.ready.parts.controller.delta) + self.period
 
 
 def on_flight_clock(scenario: Scenario) -> Scenario:

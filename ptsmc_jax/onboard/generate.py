@@ -115,11 +115,6 @@ def column_names(board: Board) -> dict[str, list[str]]:
 
 def _add_stage_function(code: Code, board: Board, stage: Stage, structs: dict[str, Struct], params: Parameters) -> None:
     """Add the function of a stage to the code."""
-
-    def fields_of(name: str) -> list[Field]:
-        prefix, _, key = name.partition(".")
-        return structs[STRUCTS[prefix]][key]
-
     shapes = {name: shape() for name, shape in SCALARS.items()}
     shapes |= {f"{prefix}.{key}": shape for prefix, struct in STRUCTS.items()
                for key, shape in getattr(board, struct).items()}  # fmt: skip
@@ -129,22 +124,20 @@ def _add_stage_function(code: Code, board: Board, stage: Stage, structs: dict[st
         parameters = jax.tree.unflatten(params.structure, parameter_leaves)
         return stage.run(parameters, dict(zip(shapes, values, strict=True)))
 
-    pool, args = Pool(), list[np.ndarray]()
+    pool = Pool()
     jaxpr, written = jax.make_jaxpr(run_stage, return_shape=True)(params.leaves, list(shapes.values()))
-    for name, shape in shapes.items():
-        if name in SCALARS:
-            args.append(object_array((), [pool.place(name, kind_of(shape.dtype))]))
-        else:
-            args += [member.nodes(pool, C_PREFIX[name.partition(".")[0]]) for member in fields_of(name)]
+    args = [object_array((), [pool.place(name, kind_of(shapes[name].dtype))]) for name in SCALARS]
+    args += [member.nodes(pool, C_PREFIX[prefix]) for prefix, struct in STRUCTS.items()
+             for members in structs[struct].values() for member in members]  # fmt: skip
     results = iter(Translator(pool).evaluate(jaxpr, [*params.nodes(pool), *args]))
     assignments, return_value, needed_arguments = list[tuple[str, Node]](), None, set[str]()
     for name in sorted(written):  # JAX flattens a dict in this order
         if name == "limited":
             return_value = next(results).item()
             continue
-        prefix = name.partition(".")[0]
+        prefix, _, key = name.partition(".")
         needed_arguments.add(prefix)
-        for member in fields_of(name):
+        for member in structs[STRUCTS[prefix]][key]:
             result = next(results)
             name_nodes(result, member.name, only_variables=True)
             locations = (C_PREFIX[prefix] + element for element in member.elements())

@@ -16,14 +16,6 @@ LIBRARY = Path(__file__).parents[1]
 HELPER_FOLDERS = ("numerics/", "onboard/")  # folders whose functions get no heading in the C
 
 
-class Section(NamedTuple):
-    """A Python function whose equations form a section of the generated C, under a heading."""
-
-    name: str
-    path: str  # path of its file for a heading
-    summary: str  # the first sentence of its docstring
-
-
 Span = tuple[int, int, int, int]  # position of an expression: first line and column, last line and column
 
 
@@ -67,14 +59,18 @@ def describe_call(calls: list[Frame]) -> tuple[str, str]:
     return next(map(ast.unparse, functions), ""), f"{file}:{span[0]}"
 
 
-def find_section(calls: list[Frame]) -> Section | None:
-    """Return the section of an equation: the innermost function that is not in `HELPER_FOLDERS`."""
+def section_heading(calls: list[Frame]) -> str:
+    """Return the heading of an equation's section in C: name, file and summary of the function that it is from.
+
+    The function is the innermost one that is not in `HELPER_FOLDERS`. Without such a function, the heading is empty.
+    """
     for frame in calls:
         path = _heading_path(frame.file)
         name = re.sub(r"\.?<(locals|lambda|genexpr|listcomp)>", "", frame.name).strip(".")
         if path and name:
-            return Section(name, path, _function_summary(frame.file, frame.span[0]))
-    return None
+            text = _function_summary(frame.file, frame.span[0])
+            return f"{name}, {path}" + (f": {text}" if text else "")
+    return ""
 
 
 @functools.cache

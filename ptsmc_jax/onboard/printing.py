@@ -91,7 +91,7 @@ class Printer:
         self.with_variable: set[Node] = set()
         self.lengths: dict[Node, int] = {}  # approximate length of the text of each expression
         self.counts: Counter[str] = Counter()
-        self.section: Any = None
+        self.section = ""  # heading of the present section
         self.count = 0
         self.table_entries = 0  # number of entries of the tables that counted loops read
         self.has_open_loop = False  # whether a loop has an unknown number of passes; `counts` has one pass of it
@@ -118,7 +118,7 @@ class Printer:
                 self.lengths[node] = 8
         indent = "    "
         lines = self._print_block(block, indent)
-        if outputs and self.section is not None:
+        if outputs and self.section:
             lines.append("")
         lines += [line for place, node in outputs for line in wrap_statement(f"{place} = {self.text(node)};", indent)]
         return lines if returned is None else [*lines, *wrap_statement(f"return {self.text(returned)};", indent)]
@@ -160,12 +160,10 @@ class Printer:
         return lines
 
     def _section_heading(self, node: Node, indent: str) -> list[str]:
-        section = node.section
-        if section is None or section == self.section:
+        if node.section in ("", self.section):
             return []
-        self.section = section
-        title = f"{section.name}, {section.path}" + (f": {section.summary}" if section.summary else "")
-        return ["", *format_comment(title, indent)]
+        self.section = node.section
+        return ["", *format_comment(node.section, indent)]
 
     def _print_branch(self, region: Region, indent: str) -> list[str]:
         results = [(k, node) for k, node in enumerate(region.results) if node in self.use_counts]
@@ -180,7 +178,7 @@ class Printer:
             if block is region.blocks[0]:
                 lines.append(f"{indent}}} else {{")
                 self.section = outer
-        self.section = None
+        self.section = ""
         return [*lines, f"{indent}}}"]
 
     def _print_loop(self, region: Region, indent: str) -> list[str]:
@@ -219,7 +217,7 @@ class Printer:
             k = self._variable_name(region.index) if region.index is not None else ""
             result = self.text(region.outputs[-1][column])
             lines += wrap_statement(f"{self._variable_name(table)}[{k}] = {result};", inner)
-        self.section = None
+        self.section = ""
         for op in self.counts:
             self.counts[op] += (self.counts[op] - counts_before[op]) * max(region.length - 1, 0)
         return [*lines, *assignments, f"{indent}}}"]

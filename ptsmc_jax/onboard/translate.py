@@ -74,7 +74,7 @@ class Translator:
 
         def translate(eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
             frames, has_value = next(frames_in_order)
-            outer, self.pool.section = self.pool.section, origins.find_section(frames) or self.pool.section
+            outer, self.pool.section = self.pool.section, origins.section_heading(frames) or self.pool.section
             results = self.translate_equation(eqn, values, frames)
             self.pool.section = outer
             if self.outer_frames is None and has_value and len(results) == 1:
