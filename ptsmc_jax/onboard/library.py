@@ -195,11 +195,9 @@ class InTheLoop:
         first_values = dict[str, Any]()
         pairs = zip(jax.tree_util.tree_leaves_with_path(self.board.parameters), params.fields, strict=True)
         for (path, _), field in sorted(pairs, key=lambda item: item[0][0][0].key in COMPUTED):
-            value = drawn_leaves.get(path)
+            value = drawn_leaves[path]
             is_derived = field.name in params.derived
-            reference = updated_leaves.get(path) if is_derived else first_values.setdefault(field.name, value)
-            if value is None or reference is None:
-                continue
+            reference = updated_leaves[path] if is_derived else first_values.setdefault(field.name, value)
             tolerance = PARAMETER_TOLERANCE * float(jnp.max(jnp.abs(value), initial=0.0))
             if not np.allclose(reference, value, rtol=0.0, atol=tolerance, equal_nan=True):
                 raise ScenarioError(

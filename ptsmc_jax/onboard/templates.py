@@ -53,24 +53,14 @@ class ExportInfo(NamedTuple):
 
 
 # public names of a controller: templates prefix them with ptsmc_ and PTSMC_, exported files with ptsmc_NAME_
-_SYMBOLS = ("init", "step", "parameters")  # names with external linkage
-_TYPES = ("params", "in", "out", "state", "derived", "real", "status")
-# functions of the flat header
-_ROW_FUNCTIONS = ("in_from", "state_from", "params_from", "out_to", "state_to", "params_to")
-_CONSTANTS = (*STATUS, "SCENARIO", *(f"{kind}_SIZE" for kind in ("IN", "OUT", "STATE", "PARAMS")))
-_PUBLIC = re.compile(
-    rf"\b(ptsmc_)({'|'.join((*_SYMBOLS, *_TYPES, *_ROW_FUNCTIONS))})\b(?!\.[ch]\b)|\b(PTSMC_)({'|'.join(_CONSTANTS)})\b"
-)
+_NAMES = "init|step|parameters|params|in|out|state|derived|real|status|(in|state|params)_from|(out|state|params)_to"
+_CONSTANTS = "|".join([*STATUS, "SCENARIO", "(IN|OUT|STATE|PARAMS)_SIZE"])
 
 
 def with_public_prefix(text: str, name: str) -> str:
     """Return a text with the controller's name in all public names, so that several controllers link together."""
-
-    def add_prefix(match: re.Match[str]) -> str:
-        lower, symbol, upper, constant = match.groups()
-        return f"{lower}{name}_{symbol}" if lower else f"{upper}{name.upper()}_{constant}"
-
-    return _PUBLIC.sub(add_prefix, text)
+    text = re.sub(rf"\bptsmc_(?=({_NAMES})\b(?!\.[ch]\b))", f"ptsmc_{name}_", text)
+    return re.sub(rf"\bPTSMC_(?=({_CONSTANTS})\b)", f"PTSMC_{name.upper()}_", text)
 
 
 def fill_template(file: str, **values: str | int) -> str:
