@@ -203,7 +203,7 @@ class Pool:
         return None
 
     def _simplify_arithmetic(self, op: str, a: Node, b: Node, kind: str) -> Node | None:
-        """Return a simpler node that equals an operation of two numbers, one of which is constant, or None."""
+        """Return a simpler node that equals an operation of a constant and another number, or None."""
         constant, other = (a, b) if a.op == "constant" else (b, a)
         value = constant.value
         if op == "mul":

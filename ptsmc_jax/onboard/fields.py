@@ -17,7 +17,7 @@ from ptsmc_jax.batching.components import object_array
 from ptsmc_jax.batching.dependence import dependence
 from ptsmc_jax.onboard.board import Board
 from ptsmc_jax.onboard.derived import Rule
-from ptsmc_jax.onboard.expressions import KINDS, Block, NoRuleError, Pool, kind_of
+from ptsmc_jax.onboard.expressions import KINDS, NoRuleError, Pool, kind_of
 from ptsmc_jax.onboard.origins import field_comments
 from ptsmc_jax.onboard.printing import Printer
 from ptsmc_jax.onboard.translate import Translator
@@ -104,8 +104,8 @@ def _names_and_meaning(path: Any, tree: Any) -> tuple[list[str], str]:
 
 def _declared_meaning(part: Any, name: str) -> str:
     """Return meaning, unit and allowed values of a field of a part, empty if its class does not declare them."""
-    field = getattr(type(part), "__dataclass_fields__", {}).get(name)
-    declared = None if field is None else field.metadata.get("declared")
+    known = getattr(type(part), "__dataclass_fields__", {})
+    declared = known[name].metadata.get("declared") if name in known else None
     if declared is None:
         return ""
     unit = declared.unit if isinstance(declared.unit, str) else declared.unit[0]
@@ -146,16 +146,6 @@ class Parameters:
         self.used |= {
             member.name for member in self.fields if f"{self.struct_pointer(member)}->{member.name}" in read_names
         }
-
-    def translate_rules(self) -> tuple[Block, dict[str, np.ndarray]]:
-        """Return the block that evaluates the rules, and the derived numbers by name."""
-        pool = Pool()
-        results = Translator(pool).evaluate(self.trace(self.rules), self.nodes(pool))
-        derived: dict[str, np.ndarray] = {}
-        for member, result in zip(self.fields, results, strict=True):
-            if member.name in self.derived:
-                derived.setdefault(member.name, result)
-        return pool.block, derived
 
     def trace(self, rules: Iterable[Rule]) -> Any:
         """Return the jaxpr that applies rules to the leaves."""

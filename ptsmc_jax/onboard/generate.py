@@ -76,11 +76,13 @@ def _add_derivation(code: Code, params: Parameters) -> None:
     code.underivable = {name: reason for name, reason in params.underivable.items() if name in params.used}
     if not code.derived:
         return
-    printer = printing.Printer()
-    block, results = params.translate_rules()
+    pool, printer = Pool(), printing.Printer()
+    results = Translator(pool).evaluate(params.trace(params.rules), params.nodes(pool))
+    # several leaves may share a field: the first one has its value
+    nodes_by_name = {member.name: result for member, result in [*zip(params.fields, results, strict=True)][::-1]}
     outputs = [(f"d->{element}", node) for member in code.derived
-            for element, node in zip(member.elements(), results[member.name].flat, strict=True)]  # fmt: skip
-    body = printer.body(block, outputs)
+            for element, node in zip(member.elements(), nodes_by_name[member.name].flat, strict=True)]  # fmt: skip
+    body = printer.body(pool.block, outputs)
     params.mark_used(printer)
     inputs = {name for member in code.derived for name in params.sources_of[member.name]}
     code.derivation_inputs = [member for member in params.used_fields("p") if member.name in inputs]

@@ -62,7 +62,7 @@ def describe_call(calls: list[Frame]) -> tuple[str, str]:
 def section_heading(calls: list[Frame]) -> str:
     """Return the heading of an equation's section in C: name, file and summary of the function that it is from.
 
-    The function is the innermost one that is not in `HELPER_FOLDERS`. Without such a function, the heading is empty.
+    Functions in `HELPER_FOLDERS` do not count. The heading is empty if all functions are in these folders.
     """
     for frame in calls:
         path = _heading_path(frame.file)

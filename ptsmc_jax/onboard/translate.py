@@ -100,7 +100,8 @@ class Translator:
         if name in ("custom_jvp_call", "custom_vjp_call"):
             inner = eqn.params["call_jaxpr"]
         if inner is not None:
-            function = _c_function(inner)
+            info = open_jaxpr(inner)[0].debug_info
+            function = C_FUNCTIONS.get((info.func_filename or "", info.func_name))
             if function is not None:
                 return self._c_call(function, values, eqn)
             outer, self.outer_frames = self.outer_frames, frames
@@ -279,12 +280,6 @@ class Translator:
 def _map_entries(rule: Callable, values: Sequence[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
     """Return the components of an elementwise function, given the components of its arguments."""
     return object_array(shape, map(rule, *(np.broadcast_to(value, shape).flat for value in values)))
-
-
-def _c_function(inner: Any) -> str | None:
-    """Return the C function of a called jaxpr, or None if C evaluates its equations."""
-    info = open_jaxpr(inner)[0].debug_info
-    return C_FUNCTIONS.get((info.func_filename or "", info.func_name))
 
 
 def _fill_value(eqn: Any) -> Any:

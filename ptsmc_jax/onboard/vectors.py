@@ -41,7 +41,7 @@ def simulate(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Sam
 
     Args:
         parts: the nominal scenario.
-        dispersion: the dispersions, except for reference and torque limit, of which the C has only the nominal values.
+        dispersion: the dispersions. Reference and torque limit stay nominal, because the C has no other values of them.
         seed: seed of the campaign.
         trial: number of the trial.
     """

@@ -4,6 +4,7 @@ import ctypes
 import os
 import shutil
 import subprocess
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -85,7 +86,7 @@ def program(tables, place):
     return made
 
 
-def step_many(library, state, inputs, parameters=np.nan, function="ptsmc_many"):
+def step_many(library, state, inputs, parameters: Any = np.nan, function="ptsmc_many"):
     """New states, outputs and statuses of a compiled controller for rows (.., columns); NaN selects its parameters."""
     shape, columns = np.shape(state)[:-1], library.columns
     state, inputs = (

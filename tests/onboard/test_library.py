@@ -351,7 +351,7 @@ def test_rows_of_other_types_are_converted_and_of_wrong_length_raise_an_error(fi
     half = [v.astype(np.float16) for v in (state, given, told)]
     after, out, _ = library.step_in_jax(*half)
     assert after.dtype == out.dtype == np.float32
-    np.testing.assert_array_equal(out, step_many(library, *half)[1].astype(np.float32))
+    np.testing.assert_array_equal(out, step_many(library, half[0], half[1], half[2])[1].astype(np.float32))
     for k in range(3):
         short = [v[: -1 if j == k else None] for j, v in enumerate((state, given, told))]
         with pytest.raises((TypeError, ValueError), match="reshape"):
