@@ -6,6 +6,7 @@ user changes gains or the body. Read `rules` first.
 
 from collections.abc import Callable
 from dataclasses import fields, replace
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -23,11 +24,13 @@ Rule = Callable[[Values], Values]  # maps all parameters to all parameters, with
 
 def rules(parts: Parts) -> list[Rule]:
     """Return the rules for the flight computer of these parts; each uses the result of the rule before it."""
-    estimator = getattr(parts.sensors, "filter", None)
-    filter_rules: list[Rule] = []
-    if estimator is not None:
-        filter_rules = [_copy_period if isinstance(estimator, KalmanFilter) else _filter_gain_rule(parts.sensors)]
-    return [_derive_inertia_inverses, _derive_observer_values, *filter_rules, _derive_wheel_allocation]
+    sensors: Any = parts.sensors
+    rules_in_order: list[Rule] = [_derive_inertia_inverses, _derive_observer_values]
+    if isinstance(getattr(sensors, "filter", None), KalmanFilter):
+        rules_in_order.append(_copy_period)
+    elif getattr(sensors, "filter", None) is not None:
+        rules_in_order.append(partial(_derive_filter_gains, sensors.every))
+    return [*rules_in_order, _derive_wheel_allocation]
 
 
 def _with_inertia_inverse(model: Any) -> Any:
@@ -56,17 +59,12 @@ def _copy_period(values: Values) -> Values:
     return values | {"filter": replace(estimator, sensors=tuple(sensors), period=period)}
 
 
-def _filter_gain_rule(sensors: Any) -> Rule:
-    samples_per_reading = sensors.every
-
-    def derive_filter_gains(values: Values) -> Values:
-        """Compute the gains of `attitude_filter.filter_gains`, with `expm1` for accuracy in single precision."""
-        interval = values.get("star_tracker_interval", values["period"] * samples_per_reading)
-        decay = -jnp.expm1(-values["filter_bandwidth"] * interval)  # 1 - p with the pole p of the filter
-        estimator = replace(values["filter"], attitude_gain=decay * (2.0 - decay), bias_gain=decay**2 / interval)
-        return values | {"filter": estimator}
-
-    return derive_filter_gains
+def _derive_filter_gains(samples_per_reading: int, values: Values) -> Values:
+    """Compute the gains of `attitude_filter.filter_gains`, with `expm1` for accuracy in single precision."""
+    interval = values.get("star_tracker_interval", values["period"] * samples_per_reading)
+    decay = -jnp.expm1(-values["filter_bandwidth"] * interval)  # 1 - p with the pole p of the filter
+    estimator = replace(values["filter"], attitude_gain=decay * (2.0 - decay), bias_gain=decay**2 / interval)
+    return values | {"filter": estimator}
 
 
 def _derive_wheel_allocation(values: Values) -> Values:

@@ -181,6 +181,7 @@ class InTheLoop:
         for (path, _), member in zip(leaves, name_parameters(self.board).fields, strict=True):
             if member.size and member.elements()[0] in columns:
                 self._columns[path] = columns[member.elements()[0]]
+        self.software = Software(self.boot, self.decide, self.statuses, on_processor=True)  # for a simulation
         self._read_outputs, self._read_state = map(_tree_reader, (self.board.outputs, self.board.state))
         if dispersion is not None and dispersion.custom is not None:
             self._check_custom_dispersion(Dispersion(custom=dispersion.custom))
@@ -221,11 +222,6 @@ class InTheLoop:
             return ""
         rest = f" and {len(differing) - MOST_LISTED} more" if len(differing) > MOST_LISTED else ""
         return f"the controller has other parameters than the scenario: {', '.join(differing[:MOST_LISTED])}{rest}"
-
-    @property
-    def software(self) -> Software:
-        """The software for a simulation."""
-        return Software(self.boot, self.decide, self.statuses, on_processor=True)
 
     def boot(self, parts: Parts, seed: Any, trial: Any, x0: Any, first: Any) -> Computer:
         """Return the flight computer before the first sample, with the state of `ptsmc_init`.
