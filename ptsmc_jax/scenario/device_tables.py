@@ -18,7 +18,7 @@ from ptsmc_jax.devices import command_filter
 from ptsmc_jax.devices.actuators import Actuators as ActuatorsPart
 from ptsmc_jax.devices.actuators import wheels
 from ptsmc_jax.devices.attitude_filter import attitude_filter, filter_between_samples
-from ptsmc_jax.devices.attitude_sensors import sample_times
+from ptsmc_jax.devices.attitude_sensors import INTEGER_TOLERANCE, sample_times
 from ptsmc_jax.devices.sensors import PerfectSensors, Sensors, StateSensor
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.scenario import errors
@@ -26,7 +26,6 @@ from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.schema import PartTable, make_table
 from ptsmc_jax.scenario.values import Count, Kinds, Meaning, NotNegative, NotNegatives, Positive, Table, Three
 
-WHOLE_TOLERANCE = 1e-9  # relative tolerance for a whole number of periods
 ONE_FOR_EACH = "one for each axis, wheel or input"
 PositiveEach = Annotated[
     tuple[Positive, ...], Meta(min_length=1, description=f"a list of numbers greater than 0, {ONE_FOR_EACH}")
@@ -180,7 +179,7 @@ class Hardware(Actuators, frozen=True):
         """Return the number of control periods between two star tracker samples, None if it is not whole."""
         ratio = self.interval(period) / period
         nearest = ratio if math.isinf(ratio) else round(ratio)  # `checks` refuses an interval longer than the run
-        return int(nearest) if abs(ratio - nearest) < WHOLE_TOLERANCE * ratio else None
+        return int(nearest) if abs(ratio - nearest) < INTEGER_TOLERANCE * ratio else None
 
     def check(self, scenario: Any) -> None:
         """Raise ScenarioError for two gyro noises, or for a slow star tracker without a filter."""
@@ -190,7 +189,7 @@ class Hardware(Actuators, frozen=True):
         tracker_period, every, period = self.star_tracker_period, self.star_tracker_every, scenario.loop.period
         if tracker_period is not None and every is not None:
             raise wrong("hardware.star_tracker_period", tracker_period, "absent if star_tracker_every is given")
-        if tracker_period is not None and tracker_period < period * (1.0 - WHOLE_TOLERANCE):
+        if tracker_period is not None and tracker_period < period * (1.0 - INTEGER_TOLERANCE):
             raise wrong("hardware.star_tracker_period", tracker_period, f"at least loop.period, {period}")
         if self.periods_per_sample(period) != 1 and not scenario.estimator.on:
             key, value, smallest = ("every", every, 1) if tracker_period is None else ("period", tracker_period, period)

@@ -17,7 +17,7 @@ from ptsmc_jax.devices import attitude_sensors, kalman_filter, sensor_suite
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.scenario import attitude_keys
 from ptsmc_jax.scenario.custom import custom_kind
-from ptsmc_jax.scenario.device_tables import WHOLE_TOLERANCE, Hardware
+from ptsmc_jax.scenario.device_tables import Hardware
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.schema import PartTable
 from ptsmc_jax.scenario.values import Kinds, Meaning, NotNegative, Positive, Table, Three
@@ -63,7 +63,7 @@ class AttitudeSensorTable(SensorTable, frozen=True):
             raise wrong(f"{place}.rotvec_deg", self.rotvec_deg, "absent if boresight is given")
         attitude_keys.check_direction(f"{place}.boresight", self.boresight or (0.0, 0.0, 1.0))
         control_period = scenario.loop.period
-        if self.period is not None and self.period < control_period * (1.0 - WHOLE_TOLERANCE):
+        if self.period is not None and self.period < control_period * (1.0 - attitude_sensors.INTEGER_TOLERANCE):
             raise wrong(f"{place}.period", self.period, f"at least loop.period, {control_period}")
         if self.period is not None and self.period > scenario.end:
             raise wrong(f"{place}.period", self.period, f"at most loop.t_end, {scenario.end}")
