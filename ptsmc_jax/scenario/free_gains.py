@@ -106,7 +106,7 @@ def _check_objective(scenario: Scenario, tune: tables.Tune, beginning: str) -> N
         return
     metrics = [name for name in scenario.metrics if name not in catalogues.LARGER_IS_BETTER]
     if tune.minimise not in metrics:
-        nearest = parsing.similar_names_hint(tune.minimise, metrics, "`ptsmc new` lists them")
+        nearest = parsing.nearest_name_hint(tune.minimise, metrics)
         raise ScenarioError(f'{minimised}, but must be a metric, "t_f" or "limits"; {nearest}')
     table_name = scenario.metrics[tune.minimise].table
     if table_name is not None and getattr(scenario, table_name, None) is None:
@@ -118,17 +118,14 @@ def _check_objective(scenario: Scenario, tune: tables.Tune, beginning: str) -> N
 def _absence_reason(scenario: Scenario, name: str) -> str:
     """Return the reason why a scenario lacks a gain, and the change that provides it."""
     law, observer = (errors.show(table.kind) for table in (scenario.controller, scenario.observer))
-    match name:
-        case "observer_gain":
-            lack = f"observer.kind = {observer} has no gain of that name"
-            return f"{lack}; allowed is observer_gain with an observer of another kind"
-        case "filter_bandwidth":
-            return 'there is no filter; allowed is filter_bandwidth with [filter] of kind "steady_state"'
-        case "command_corner":
-            return "the command is not filtered; allowed is command_corner with hardware.command_filter"
-    gains = (*scenario.controller.gains, *scenario.observer.gains, *tables.NON_LAW_GAINS)
-    lack = f"the law of controller.kind = {law} has no {name}"
-    return f"{lack}; allowed is some of {', '.join(dict.fromkeys(gains))}"
+    others = {
+        "observer_gain": f"observer.kind = {observer} has no gain of that name; allowed is an observer of another kind",
+        "filter_bandwidth": 'there is no filter; allowed is filter_bandwidth with [filter] of kind "steady_state"',
+        "command_corner": "the command is not filtered; allowed is command_corner with hardware.command_filter",
+    }
+    gains = dict.fromkeys((*scenario.controller.gains, *scenario.observer.gains, *others))
+    law_reason = f"the law of controller.kind = {law} has no {name}; allowed is some of {', '.join(gains)}"
+    return others.get(name, law_reason)
 
 
 def _check_bounds(context: BoundsContext, name: str) -> None:
@@ -186,12 +183,9 @@ def reason_of_bound(scenario: Scenario, name: str, side: str, bound: float) -> s
         side: "lower" or "upper".
         bound: the bound.
     """
-    tune = scenario.tune
-    if not scenario.sampled or tune is None:
-        return None
     gain_rules = gain_bounds.bounds_of(scenario, name)
     reason = gain_rules.reason_below if side == "lower" else gain_rules.reason_above
-    if reason is None:
+    if not scenario.sampled or reason is None:
         return None
     low, high = usual_bounds(scenario, name)
     is_reached = bound <= low * (1 + 1e-9) if side == "lower" else bound >= high * (1 - 1e-9)
@@ -212,13 +206,10 @@ def value_beyond_bound(scenario: Scenario, name: str, side: str) -> float | None
     Returns:
         The value. None: `reason_of_bound` gives a reason, or no value beyond the bound is allowed.
     """
-    tune = scenario.search
-    low, high = tune.bounds[name]
+    low, high = scenario.search.bounds[name]
     if reason_of_bound(scenario, name, side, low if side == "lower" else high) is not None:
         return None
-    smallest, largest, _ = gain_bounds.bounds_of(scenario, name).allowed(
-        BoundsContext(scenario, tune.gains, tune.bounds)
-    )
+    smallest, largest, _ = gain_bounds.bounds_of(scenario, name).allowed(_search_context(scenario))
     if is_log_scaled(low, high):
         step = (high / low) ** 0.1
         value = low / step if side == "lower" else high * step
@@ -243,15 +234,13 @@ def widen_bounds(
         sides: "lower" or "upper" for each gain on a bound, by its name.
         defaulted: paths of the keys that the user's scenario leaves out.
     """
-    tune, wider = scenario.search, dict[str, tuple[float, float]]()
+    bounds, wider = scenario.search.bounds, dict[str, tuple[float, float]]()
     for name, side in sides.items():
-        low, high = tune.bounds[name]
+        low, high = bounds[name]
         is_default = ("tune", "bounds", name) in defaulted
         if not is_default or reason_of_bound(scenario, name, side, low if side == "lower" else high) is not None:
             continue
-        smallest, largest, _ = gain_bounds.bounds_of(scenario, name).allowed(
-            BoundsContext(scenario, tune.gains, tune.bounds)
-        )
+        smallest, largest, _ = gain_bounds.bounds_of(scenario, name).allowed(_search_context(scenario))
         if name == "delta":  # the upper bound stays: the clock has samples for it only
             largest = high
         if side == "lower" and is_log_scaled(low, high) and math.isfinite(smallest):
@@ -260,18 +249,20 @@ def widen_bounds(
             low = max(low - 0.5 * (high - low), 0.5 * (smallest + low))
         else:
             high = min(10.0 * high if is_log_scaled(low, high) else high + 0.5 * (high - low), 0.5 * (largest + high))
-        if (low, high) != tune.bounds[name]:
+        if (low, high) != bounds[name]:
             wider[name] = low, high
     return wider
 
 
 def usual_bounds(scenario: Scenario, name: str) -> tuple[float, float]:
     """Return the usual bounds of a free gain, before they are widened to include the scenario's gain."""
-    tune = scenario.search
-    return gain_bounds.bounds_of(scenario, name).usual(BoundsContext(scenario, tune.gains, tune.bounds))
+    return gain_bounds.bounds_of(scenario, name).usual(_search_context(scenario))
 
 
 def default_bounds(scenario: Scenario, name: str) -> tuple[float, float]:
     """Return the default bounds of a free gain: the usual ones, widened to include the scenario's gain."""
-    tune = scenario.search
-    return _default_bounds(BoundsContext(scenario, tune.gains, tune.bounds), name)
+    return _default_bounds(_search_context(scenario), name)
+
+
+def _search_context(scenario: Scenario) -> BoundsContext:
+    return BoundsContext(scenario, scenario.search.gains, scenario.search.bounds)

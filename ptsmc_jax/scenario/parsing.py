@@ -35,6 +35,7 @@ from ptsmc_jax.simulation import catalogues
 
 DEEPEST = 8  # nesting of tables and arrays; a rotation matrix of a disturbance in a sum has depth 6
 LONGEST_KEY = 100  # largest number of characters of a key
+MOST_LISTED = 40  # largest number of known names that an error lists
 _TOO_DEEP = f"but at most {DEEPEST} levels are allowed"
 # a very long dotted key: the memory that the parser needs for it grows with the square of its length
 _LONG_DOTTED_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){20}""")
@@ -127,8 +128,7 @@ def _check_shape(name: str, value: Any, levels: int) -> None:
     if isinstance(value, Mapping):
         for key in value:
             if not (isinstance(key, str) and key.isprintable() and 0 < len(key) <= LONGEST_KEY):
-                key_text = brief(key) if isinstance(key, str) else repr(key)
-                raise ScenarioError(f"{name or 'the scenario'} has the key {key_text}, which is not a known one")
+                raise ScenarioError(f"{name or 'the scenario'} has the key {brief(key)}, which is not a known one")
         children = [(name or key, inner) for key, inner in value.items()]
     else:
         children = [(name, inner) for inner in value] if isinstance(value, list | tuple) else []
@@ -154,8 +154,7 @@ def _unknown_table_error(name: str, value: Any, kind: str) -> ScenarioError:
     if other_plants:
         return ScenarioError(f"[{name}] needs plant.kind = {show(other_plants[0])}, but it is {show(kind)}")
     if isinstance(value, Mapping):
-        plant_hint = f"such a plant is [plant] with kind = {show(name)}"
-        hint = plant_hint if name in TABLES else nearest_name_hint(name, (*layout, "requirements"), "[{}]")
+        hint = nearest_name_hint(name, (*layout, "requirements"), "[{}]")
         return ScenarioError(f"[{name}] is not a known table; {hint}")
     tables_of_key = keys.table_names_by_key(layout)
     closest = difflib.get_close_matches(name, tables_of_key, n=1, cutoff=0.0)[0]
@@ -234,7 +233,7 @@ def _without_none(value: Any) -> Any:
 
 
 def nearest_name_hint(name: str, known: Iterable[str], template: str = "{}") -> str:
-    """Return a hint for an unknown name: the most similar known name, or all known names.
+    """Return a hint for an unknown name: the most similar known name, or all known names if they are few.
 
     Args:
         name: the unknown name.
@@ -242,26 +241,10 @@ def nearest_name_hint(name: str, known: Iterable[str], template: str = "{}") -> 
         template: format of a known name in the hint.
     """
     known = list(known)
-    matches = difflib.get_close_matches(name, known, n=1)
+    matches = difflib.get_close_matches(name, known, n=1, cutoff=0.6 if len(known) <= MOST_LISTED else 0.0)
     if matches:
         return f"the nearest known one is {template.format(matches[0])}"
     return f"known are {', '.join(template.format(one) for one in known)}"
-
-
-def similar_names_hint(name: str, known: Iterable[str], where_listed: str) -> str:
-    """Return a hint for an unknown name if there are too many known names to list.
-
-    Args:
-        name: the unknown name.
-        known: the known names.
-        where_listed: where to find all names, in words.
-
-    Returns:
-        The three most similar names, followed by `where_listed`.
-    """
-    known = list(known)
-    matches = difflib.get_close_matches(name, known, n=3, cutoff=0.0)
-    return f"the nearest of {len(known)} known ones are {', '.join(matches)}; {where_listed}"
 
 
 def _parse_table(

@@ -4,6 +4,7 @@ Three warnings concern noise: disturbance bounds far from the disturbance, noisy
 others concern values in wrong units, a sliding surface too fast for the period, and a ground target below the horizon.
 """
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -26,117 +27,102 @@ def warnings(scenario: Scenario) -> list[str]:
     """
     bounds = disturbance_tables.largest_disturbance(scenario)
     bound_warnings = (
-        [] if bounds is None else [*_implausible_bound(scenario, *bounds), *_noisy_estimate(scenario, bounds[0])]
+        () if bounds is None else (*_implausible_bound(scenario, *bounds), *_noisy_estimate(scenario, bounds[0]))
     )
-    checks = (_perfect_gyro, _noise_in_wrong_unit, _delay_in_seconds, _unstable_surface_rate, _target_below_horizon)
+    checks = (_implausible_noise, _delay_in_seconds, _unstable_surface_rate, _target_below_horizon)
     return [*bound_warnings, *(warning for check in checks for warning in check(scenario))]
 
 
-def _target_below_horizon(scenario: Scenario) -> list[str]:
+def _target_below_horizon(scenario: Scenario) -> Iterator[str]:
     """Warn about a ground target that the Earth hides during the run."""
     reference: Any = getattr(scenario, "reference", None)
-    if not hasattr(reference, "lowest_elevation"):
-        return []
-    elevation, t = reference.lowest_elevation(scenario)
-    if elevation >= 0.0:
-        return []
-    return [
-        f"reference.kind is {errors.show(reference.kind)}, but at t = {t:.4g} s the Earth hides the target: seen from "
-        f"there the spacecraft is {-np.rad2deg(elevation):.3g} deg below the horizon"
-    ]
+    if hasattr(reference, "lowest_elevation"):
+        elevation, t = reference.lowest_elevation(scenario)
+        if elevation < 0.0:
+            yield (
+                f"reference.kind is {errors.show(reference.kind)}, but at t = {t:.4g} s the Earth hides the target: "
+                f"seen from there the spacecraft is {-np.rad2deg(elevation):.3g} deg below the horizon"
+            )
 
 
-def _delay_in_seconds(scenario: Scenario) -> list[str]:
+def _delay_in_seconds(scenario: Scenario) -> Iterator[str]:
     """Warn about a delay that was probably given in seconds: the key counts control periods."""
     delay, period = scenario.devices.delay_periods, scenario.loop.period
-    if delay * period < MAX_DELAY_FRACTION * scenario.controller.t_f:
-        return []
-    return [
-        f"hardware.delay is {delay} control periods of {period:g} s, together {delay * period:g} s; the key is not a "
-        "time in seconds"
-    ]
+    if delay * period >= MAX_DELAY_FRACTION * scenario.controller.t_f:
+        yield (
+            f"hardware.delay is {delay} control periods of {period:g} s, together {delay * period:g} s; the key is not "
+            "a time in seconds"
+        )
 
 
-def _unstable_surface_rate(scenario: Scenario) -> list[str]:
+def _unstable_surface_rate(scenario: Scenario) -> Iterator[str]:
     """Warn if no K1 stabilises the sampled hold phase at the scenario's surface rate c.
 
     The published c = 1 1/s assumes a control period that is short compared with 1 s.
     """
     law: Any = scenario.controller
     if not scenario.sampled or law.kind != "prescribed_time" or scenario.order != 2:
-        return []
+        return
     period, delay = scenario.loop.period, scenario.devices.delay_periods
     first_coefficient = getattr(law, "a", (1.0,))[0]  # the surface of a chain has the rate c a_1
     stability_limit = stability_limits.largest_surface(delay, implicit=law.implicit) / (first_coefficient * period)
-    if law.surface_rate < stability_limit:
-        return []
-    delayed = f" and a delay of {delay}" if delay else ""
-    return [
-        f"controller.surface_rate is {law.surface_rate:g} 1/s: at a period of {period:g} s{delayed} no k1 stabilises "
-        f"the hold phase; use a surface_rate below {stability_limit:.3g} 1/s, or add it to tune.free"
-    ]
+    if law.surface_rate >= stability_limit:
+        delayed = f" and a delay of {delay}" if delay else ""
+        yield (
+            f"controller.surface_rate is {law.surface_rate:g} 1/s: at a period of {period:g} s{delayed} no k1 "
+            f"stabilises the hold phase; use a surface_rate below {stability_limit:.3g} 1/s, or add it to tune.free"
+        )
 
 
-def _noise_in_wrong_unit(scenario: Scenario) -> list[str]:
-    """Warn about a star tracker whose noise is larger than that of any real device."""
-    noise = getattr(scenario.hardware, "attitude_noise", None)
-    if not noise or noise < MAX_ATTITUDE_NOISE:
-        return []
-    return [
-        f"hardware.attitude_noise is {noise:g} rad, {np.rad2deg(noise):.3g} deg, which is very large; a number in "
-        f'another unit has the unit in its value: "{noise:g} arcsec"'
-    ]
-
-
-def _perfect_gyro(scenario: Scenario) -> list[str]:
-    """Warn about a noisy star tracker with a gyro without errors: the law then knows the true rate."""
+def _implausible_noise(scenario: Scenario) -> Iterator[str]:
+    """Warn about a noisy star tracker whose gyro has no errors, or whose noise is larger than that of a real device."""
     device: Any = scenario.hardware
-    noise = getattr(device, "attitude_noise", None)
+    noise = getattr(device, "attitude_noise", None) or 0.0
     gyro_keys = ("rate_noise", "rate_noise_density", "rate_bias", "rate_bias_walk")
-    if not noise or scenario.sensors is not None or any(getattr(device, name) is not None for name in gyro_keys):
-        return []
-    return [
-        f"hardware.attitude_noise is {noise:g}, but the gyro has no error: the law measures the true rate; "
-        "set hardware.rate_noise or rate_noise_density, or rate_noise = 0 to confirm a perfect gyro"
-    ]
+    if noise and scenario.sensors is None and all(getattr(device, name) is None for name in gyro_keys):
+        yield (
+            f"hardware.attitude_noise is {noise:g}, but the gyro has no error: the law measures the true rate; "
+            "set hardware.rate_noise or rate_noise_density, or rate_noise = 0 to confirm a perfect gyro"
+        )
+    if noise >= MAX_ATTITUDE_NOISE:
+        yield (
+            f"hardware.attitude_noise is {noise:g} rad, {np.rad2deg(noise):.3g} deg, which is very large; a number in "
+            f'another unit has the unit in its value: "{noise:g} arcsec"'
+        )
 
 
-def _implausible_bound(scenario: Scenario, bound: float, rate_bound: float) -> list[str]:
+def _implausible_bound(scenario: Scenario, bound: float, rate_bound: float) -> Iterator[str]:
     """Warn about a stated bound that is more than `MAX_BOUND_RATIO` times too large or too small.
 
     Only the bound that the law uses is examined: K without an observer, c with an observer.
     """
-    if not scenario.controller.law.switches:
-        return []
     name, computed = ("disturbance_rate_bound", rate_bound)
     if scenario.observer.kind in ("none", "custom"):
         name, computed = ("disturbance_bound", bound)
     stated = getattr(scenario.controller, name)
-    if stated is None or max(stated, computed) <= MAX_BOUND_RATIO * min(stated, computed):
-        return []
-    comparison = (
-        f"controller.{name} is {stated:g}, but the disturbance of [disturbance] and [dispersion] has {computed:g}"
-    )
-    if stated > computed:
-        return [
-            f"{comparison}: the law switches more than necessary, and chatters; remove the key to use the bound of the "
-            "disturbance"
-        ]
-    return [f"{comparison}: the law may not reject it; remove the key to use the bound of the disturbance"]
+    if not scenario.controller.law.switches or stated is None:
+        return
+    if max(stated, computed) > MAX_BOUND_RATIO * min(stated, computed):
+        effect = "switches more than necessary, and chatters" if stated > computed else "may not reject it"
+        yield (
+            f"controller.{name} is {stated:g}, but the disturbance of [disturbance] and [dispersion] has "
+            f"{computed:g}: the law {effect}; remove the key to use the bound of the disturbance"
+        )
 
 
-def _noisy_estimate(scenario: Scenario, disturbance_bound: float) -> list[str]:
+def _noisy_estimate(scenario: Scenario, disturbance_bound: float) -> Iterator[str]:
     """Warn about an observer whose estimate has more noise than the disturbance has amplitude."""
     noise = estimate_noise(scenario)
-    if not noise > disturbance_bound > 0.0:
-        return []
-    gain = scenario.observer.gain
-    shown = errors.brief([float(f"{one:.4g}") for one in gain] if len(set(gain)) > 1 else float(f"{gain[0]:.4g}"))
-    unit = " N m" if scenario.motion == "spacecraft" else ""
-    return [
-        f"observer.gain is {shown}: the noise of its estimate, {noise:.2g}{unit} (1 sigma), is larger than the "
-        f"disturbance, at most {disturbance_bound:.3g}{unit}; try a smaller gain"
-    ]
+    if noise > disturbance_bound > 0.0:
+        gain = scenario.observer.gain
+        rounded = [float(f"{one:.4g}") for one in gain]
+        shown = errors.brief(rounded if len(set(gain)) > 1 else rounded[0])
+        unit = " N m" if scenario.motion == "spacecraft" else ""
+        yield (
+            f"observer.gain is {shown}: the noise of its estimate, "
+            f"{noise:.2g}{unit} (1 sigma), is larger than the disturbance, at most {disturbance_bound:.3g}{unit}; "
+            "try a smaller gain"
+        )
 
 
 def estimate_noise(scenario: Scenario) -> float:

@@ -83,24 +83,16 @@ def check_reference_path(scenario: Any, parts: Parts) -> None:
         return
     times = np.linspace(0.0, float(parts.t_end), 4001)
     scalar_parts = np.asarray(_scalar_part(parts.reference, times))
+    beginning = f"reference.kind is {errors.show(scenario.reference.kind)}, but its attitude"
     if not np.all(np.isfinite(scalar_parts)):
         time = float(times[int(np.argmin(np.isfinite(scalar_parts)))])
+        raise ScenarioError(f"{beginning} is not finite at t = {time:.4g} s; allowed are finite numbers until t_end")
+    crossed = np.sign(scalar_parts) != np.sign(scalar_parts[0])
+    nearest = int(np.argmax(crossed) if np.any(crossed) else np.argmin(np.abs(scalar_parts)))
+    if np.any(crossed) or abs(scalar_parts[nearest]) < SINGULAR_DISTANCE:
         raise ScenarioError(
-            f"reference.kind is {errors.show(scenario.reference.kind)}, but its attitude is not finite at "
-            f"t = {time:.4g} s; allowed are finite numbers until t_end"
-        )
-    closest = int(np.argmin(np.abs(scalar_parts)))
-    crosses = np.any(np.sign(scalar_parts) != np.sign(scalar_parts[0]))
-    if crosses or abs(scalar_parts[closest]) < SINGULAR_DISTANCE:
-        time = (
-            float(times[int(np.argmax(np.sign(scalar_parts) != np.sign(scalar_parts[0])))])
-            if crosses
-            else float(times[closest])
-        )
-        raise ScenarioError(
-            f"reference.kind is {errors.show(scenario.reference.kind)}, but its attitude reaches {_Q4_ZERO}, "
-            f"at t = {time:.4g} s; allowed is a reference that stays away from it until t_end, "
-            'or controller.error = "multiplicative"'
+            f"{beginning} reaches {_Q4_ZERO}, at t = {float(times[nearest]):.4g} s; allowed is a reference that stays "
+            'away from it until t_end, or controller.error = "multiplicative"'
         )
 
 

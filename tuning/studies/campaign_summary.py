@@ -326,10 +326,7 @@ def worst_trials(folder: Folder, by: str, count: int) -> pl.DataFrame:
         if name not in (run_tables.TRIAL, *run_tables.STATUS_COLUMNS, *run_tables.RESULT_COLUMNS.values())
     ]
     if by not in allowed:
-        hint = f"the head of {folder.path / 'worst.csv'}, which ptsmc worst writes without --by, has all of them"
-        raise RefusedError(
-            f"--by is {by}, but must be a column of the rows; {parsing.similar_names_hint(by, allowed, hint)}"
-        )
+        raise RefusedError(f"--by is {by}, but must be a column of the rows; {parsing.nearest_name_hint(by, allowed)}")
     frame = rows.read(parts, [by, "status"]).head(folder.trials)
     failed = ~running.has_finished(frame)
     chosen = most_extreme(by, frame[by].fill_null(float("nan")).to_numpy(), failed, count)
