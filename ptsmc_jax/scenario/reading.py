@@ -88,6 +88,11 @@ def complete(scenario: Scenario) -> Scenario:
     return from_tables(parsing.stated_tables(scenario), run=True) if custom.has_unloaded_code(scenario) else scenario
 
 
+def freeze_defaults(scenario: Scenario) -> Scenario:
+    """Return a scenario whose defaults count as stated values, so that `replace` does not change them."""
+    return msgspec.structs.replace(scenario, defaulted={})
+
+
 def replace(scenario: Scenario | str | Path, **changes: Any) -> Scenario:
     """Return a validated scenario with other values, such as replace(scenario, controller__eta=4.0).
 
@@ -170,4 +175,4 @@ def in_scenario(scenario: Scenario, gains: Mapping[str, Any]) -> Scenario:
             changes |= {f"{outer}__{key}": value for key, value in values.items()}
     if "t_f" in gains:
         changes["loop__t_end"] = gains["t_f"] + (scenario.end - scenario.controller.t_f)
-    return replace(msgspec.structs.replace(scenario, defaulted={}), **changes)  # defaults count as stated
+    return replace(freeze_defaults(scenario), **changes)

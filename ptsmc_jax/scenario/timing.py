@@ -84,10 +84,10 @@ def reach_of(scenario: Scenario, **changes: float) -> Reach:
     for name, value in changes.items():
         if name not in names:
             raise ValueError(f"there is no {name} in a reach; allowed are {', '.join(names)}")
-        if np.ndim(value) or np.asarray(value).dtype.kind not in "iuf" or not 0.0 <= value < math.inf:
-            raise ValueError(f"{name} is {value!r}, but must be a finite number of at least 0")
-        if name in _POSITIVE_FIELDS and value == 0.0:
-            raise ValueError(f"{name} is {value!r}, but must be greater than 0")
+        is_number = np.ndim(value) == 0 and np.asarray(value).dtype.kind in "iuf" and 0.0 <= value < math.inf
+        if not is_number or (name in _POSITIVE_FIELDS and value == 0.0):
+            smallest = "greater than 0" if name in _POSITIVE_FIELDS else "of at least 0"
+            raise ValueError(f"{name} is {value!r}, but must be a finite number {smallest}")
     law = scenario.controller
     gains, delta = getattr(scenario.observer, "gain", (0.0,)), scenario.hand_over
     k1, width, rate = getattr(law, "k1", 1.0), getattr(law, "sign_width", 0.0), getattr(law, "surface_rate", 1.0)

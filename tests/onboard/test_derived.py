@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
-import msgspec
 import numpy as np
 import pytest
 
@@ -102,7 +101,7 @@ def put(library, name, value):
 
 def exported(tables, place):
     """A complete scenario, whose defaults do not follow later changes, and its compiled controller."""
-    return msgspec.structs.replace(program(tables, place).scenario, defaulted={}), Library(place)
+    return scenario.reading.freeze_defaults(program(tables, place).scenario), Library(place)
 
 
 def changed(known, changes):

@@ -342,8 +342,8 @@ def test_the_clock_covers_the_reach_of_the_gains(mode):
 @pytest.mark.parametrize(
     ("farther", "refused"),
     [
-        ({"smallest_t_f": 0.0}, "smallest_t_f is 0.0, but must be greater than 0"),
-        ({"smallest_period": 0}, "smallest_period is 0, but must be greater than 0"),
+        ({"smallest_t_f": 0.0}, "smallest_t_f is 0.0, but must be a finite number greater than 0"),
+        ({"smallest_period": 0}, "smallest_period is 0, but must be a finite number greater than 0"),
         ({"t_f": 20.0}, "smallest_t_f is 30, but must be at most t_f, 20"),
         ({"smallest_delta": 1e9}, "smallest_delta is 1e+09, but must be at most delta, 0.05"),
     ],
