@@ -33,30 +33,21 @@ class Limits(NamedTuple):
     """Range of allowed values of a number."""
 
     above: float = -math.inf
-    below: float = math.inf
     at_least: float = -math.inf
+    below: float = math.inf
     at_most: float = math.inf
 
     def meta(self, description: str) -> Meta:
         """Return the limits for `msgspec`."""
-        named = zip(("gt", "lt", "ge", "le"), self, strict=True)
+        named = zip(("gt", "ge", "lt", "le"), self, strict=True)
         limits: dict[str, Any] = {name: limit for name, limit in named if math.isfinite(limit)}
         return Meta(description=description, **limits)
 
-    def words(self, *, several: bool = False) -> str:
+    def words(self) -> str:
         """Return the limits in words that follow "a number" or "three numbers", empty if there are none."""
-        above, below, at_least, at_most = (f"{limit:g}" if math.isfinite(limit) else "" for limit in self)
-        if above and below:
-            return f" between {above} and {below}"
-        if above and at_most:
-            return f" greater than {above} and at most {at_most}"
-        if at_least and (below or at_most):
-            return f" from {at_least} to {at_most or f'below {below}'}"
-        limits = [f"greater than {above}"] * bool(above) + [f"of at least {at_least}"] * bool(at_least)
-        limits += [f"below {below}"] * bool(below) + [f"of at most {at_most}"] * bool(at_most)
-        if limits == [f"of at least {at_least}"] and not several:
-            return f", at least {at_least}"
-        return " " + " and ".join(limits) if limits else ""
+        named = zip(("greater than", "of at least", "below", "at most"), self, strict=True)
+        limits = [f"{name} {limit:g}" for name, limit in named if math.isfinite(limit)]
+        return f" {' and '.join(limits)}" if limits else ""
 
 
 class Declaration(NamedTuple):
@@ -84,7 +75,7 @@ class Declaration(NamedTuple):
         value = self.default.value if isinstance(self.default, Scaled) else self.default
         if not self.each and not isinstance(value, tuple):
             return number_type
-        words = self.limits.words(several=True)
+        words = self.limits.words()
         if self.any_length:
             return Annotated[tuple[number_type, ...], Meta(description=self.allowed, min_length=1)]
         if not self.each:
@@ -125,7 +116,7 @@ def number(
         allowed: the allowed values in words; by default they are made from the limits.
         kw_only: as for `dataclasses.field`.
     """
-    limits = Limits(above, below, at_least, at_most)
+    limits = Limits(above, at_least, below, at_most)
     return _make_field(Declaration(default, meaning, unit, limits, each, any_length, allowed), kw_only=kw_only)
 
 
@@ -161,7 +152,7 @@ def gain(
         allowed: as for `number`.
         free: whether tuning moves it by default; "sampled": in the sampled loop only.
     """
-    limits = Limits(-math.inf if math.isfinite(at_least) else above, below, at_least, at_most)
+    limits = Limits(-math.inf if math.isfinite(at_least) else above, at_least, below, at_most)
     return _make_field(Declaration(default, meaning, unit, limits, each, False, allowed, True, usual, free))
 
 

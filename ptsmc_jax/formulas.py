@@ -8,17 +8,14 @@ from numpy.typing import ArrayLike
 ARCSEC = 180.0 * 3600.0 / np.pi  # arcsec in a radian
 
 
-def check_inertia(inertia: object) -> np.ndarray:
+def check_inertia(inertia: Any) -> np.ndarray:
     """Return the inertia tensor (3, 3) [kg m^2] from three principal moments or a tensor.
 
     Raises:
         ValueError: no rigid body has this inertia; the message gives the reason.
     """
     try:
-        tensor = np.asarray(inertia)
-        if not np.issubdtype(tensor.dtype, np.number):
-            raise TypeError
-        tensor = tensor.astype(float)
+        tensor = np.asarray(inertia, dtype=float)
     except (ValueError, TypeError):  # rows of different lengths, or values that are not numbers
         tensor = np.zeros(0)
     tensor = np.diag(tensor) if tensor.shape == (3,) else tensor

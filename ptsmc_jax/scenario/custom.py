@@ -49,6 +49,7 @@ class Custom:
         return self.part_class is None
 
 
+@functools.cache  # as for `schema.make_table`
 def custom_kind(
     table: Any, base: type, required_methods: tuple[str, ...], summary: str, has_gains: bool = False
 ) -> Any:

@@ -112,7 +112,7 @@ def _declared_bounds(declared: Declaration, gain_name: str) -> GainBounds:
         if not (limits.above < low < high < limits.below and limits.at_least <= low and high <= limits.at_most):
             raise ScenarioError(
                 f"the usual bounds of the {gain_name} are [{low:g}, {high:g}], but must be two "
-                f"numbers{limits.words(several=True)}, the lower one first"
+                f"numbers{limits.words()}, the lower one first"
             )
         return low, high
 

@@ -11,10 +11,8 @@ from typing import Any, Literal, NamedTuple
 
 import msgspec
 
-from ptsmc_jax.declare import Declaration
+from ptsmc_jax.scenario.values import UNIT_OF_D as UNIT_OF_D
 from ptsmc_jax.scenario.values import Kinds, Meaning, Table
-
-UNIT_OF_D = "unit of d"  # placeholder in declared units: replaced by the unit of the plant's disturbance d, if known
 
 
 class Key(NamedTuple):
@@ -42,24 +40,15 @@ def list_keys(struct: type[Table], unit_of_d: str = UNIT_OF_D) -> list[Key]:
         struct: the table.
         unit_of_d: the unit of the plant's disturbance, for units that contain it.
     """
-    hints = typing.get_type_hints(struct, include_extras=True)
-    declared: Mapping[str, Declaration] = getattr(struct, "declared", {})
-    keys = []
+    hints, keys = typing.get_type_hints(struct, include_extras=True), []
     for field in msgspec.structs.fields(struct):
         if field.name in ("kind", "rest"):
             continue
-        factory, plant_unit = field.default_factory, unit_of_d
-        default = field.default if factory is msgspec.NODEFAULT else factory()
-        if field.name in declared:
-            declaration, body = declared[field.name], struct.body  # pyright: ignore[reportAttributeAccessIssue]
-            meaning, unit = declaration.meaning, declaration.unit
-            unit = unit if isinstance(unit, str) else unit[not body]
-            plant_unit = "N m" if body else unit_of_d
-        else:
-            meaning, unit = next(one for one in hints[field.name].__metadata__ if isinstance(one, Meaning))
-        unit = unit.replace(UNIT_OF_D, plant_unit)
-        unit = unit.replace("unit of u", "N m") if plant_unit == "N m" else unit
+        default = field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
         type_ = hints[field.name]
+        meaning, unit = next(one for one in type_.__metadata__ if isinstance(one, Meaning))
+        unit = unit.replace(UNIT_OF_D, unit_of_d)
+        unit = unit.replace("unit of u", "N m") if unit_of_d == "N m" else unit
         keys.append(Key(field.name, meaning, unit, allowed_values(type_), default, type_))
     return keys
 

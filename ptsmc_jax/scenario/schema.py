@@ -8,14 +8,14 @@ import dataclasses
 import functools
 import inspect
 from collections.abc import Mapping
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
 
 from ptsmc_jax import declare
 from ptsmc_jax.declare import Declaration, Scaled
 from ptsmc_jax.numerics.pytrees import pytree, vector
-from ptsmc_jax.scenario.values import Table
+from ptsmc_jax.scenario.values import UNIT_OF_D, Meaning, Table
 
 
 class PartTable(Table, frozen=True):
@@ -61,6 +61,7 @@ def register_pytree(part_class: type) -> type:
         return part_class
 
 
+@functools.cache  # plants share a table, which the reference pages then show once
 def make_table(
     base: Any, part_class: Any, kind: str, body: bool = True, changes: tuple[tuple[str, Any], ...] = ()
 ) -> Any:
@@ -83,8 +84,11 @@ def extend_table(base: Any, part_class: Any, kind: str, declared: Mapping[str, D
     fields: list[tuple[str, Any, Any]] = [("kind", Literal[kind], kind)]
     for name, declaration in declared.items():
         scaled = declaration.default is None or isinstance(declaration.default, Scaled)
-        type_ = declaration.type(body)
-        fields.append((name, type_ | None if scaled else type_, None if scaled else declaration.default))
+        type_ = declaration.type(body) | None if scaled else declaration.type(body)
+        unit = declaration.unit if isinstance(declaration.unit, str) else declaration.unit[not body]
+        unit = unit.replace(UNIT_OF_D, "N m") if body else unit
+        annotated = Annotated[type_, Meaning(declaration.meaning, unit)]
+        fields.append((name, annotated, None if scaled else declaration.default))
     gains_by_name = {base.prefix + name: declaration for name, declaration in declared.items() if declaration.gain}
     class_variables = {
         "__doc__": inspect.cleandoc(part_class.__doc__ or "").split("\n\n")[0],

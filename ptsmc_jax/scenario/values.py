@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 else:
     ResolvedPositive = Positive | None
 
+UNIT_OF_D = "unit of d"  # placeholder in declared units: replaced by the unit of the plant's disturbance d, if known
 MOST_STEPS = 200_000  # largest number of integration steps in a run
 
 
