@@ -1,5 +1,7 @@
 """Defaults, bounds and designs scale with the mission: other units of time and inertia only rescale them."""
 
+import copy
+import re
 import tomllib
 from collections.abc import Mapping
 from typing import Any
@@ -7,12 +9,78 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ptsmc_jax.scenario import from_tables, parsing
+from ptsmc_jax.scenario import from_tables, keys, layouts, parsing
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.law_tables import LAWS
+from ptsmc_jax.simulation import catalogues
 from tests.tree import ROOT
-from tests.units import in_units, powers
 from tuning.search import gains as gain_names
+from tuning.studies import tuner
+
+# powers of the units of inertia and of time in a unit
+UNITS = {"kg": (1.0, 0.0), "N": (1.0, -2.0), "s": (0.0, 1.0), "Hz": (0.0, -1.0), "rad": (0.0, 0.0), "deg": (0.0, 0.0),
+         "m": (0.0, 0.0), "1": (0.0, 0.0), "-": (0.0, 0.0), "dB": (0.0, 0.0)}  # fmt: skip
+
+
+def powers(unit: str) -> tuple[float, float]:
+    """Return the powers of inertia and time in a unit such as "rad/s/sqrt(Hz)"; lengths are part of the inertia.
+
+    >>> powers("N m s"), powers("rad/s/sqrt(Hz)"), powers("sqrt(kg) m"), powers("1/s^2")
+    ((1.0, -1.0), (0.0, -0.5), (0.5, 0.0), (0.0, -2.0))
+    """
+    total = np.zeros(2)
+    for sign, part in re.findall(r"(^|/)([^/]+)", unit):
+        for root, name, power in re.findall(r"(sqrt\()?([A-Za-z]+|1|-)\)?(?:\^(\d))?", part):
+            weight = (0.5 if root else 1.0) * float(power or 1) * (-1.0 if sign else 1.0)
+            total += weight * np.asarray(UNITS[name])
+    return float(total[0]), float(total[1])
+
+
+def in_units(tables: Mapping[str, Any], inertia: float, time: float) -> dict[str, Any]:
+    """Return the tables of a scenario with every number in other units, according to the declared units of keys."""
+    plant = tables.get("plant", {}).get("kind", "spacecraft")
+    layout: Mapping[str, Any] = layouts.TABLES[plant]
+    scaled = copy.deepcopy(dict(tables))
+
+    def times(value: Any, unit: str) -> Any:
+        if isinstance(value, list | tuple):
+            return [times(one, unit) for one in value]
+        if isinstance(value, str):
+            found = re.fullmatch(r"([-+.\deE]+) (.*)", value)
+            assert found is not None
+            value = float(found[1]) * catalogues.UNITS[unit][found[2]]
+        mass, second = powers(unit)
+        return value * inertia**mass * time**second
+
+    def of(table: dict[str, Any], struct: Any) -> None:
+        for key in keys.list_keys(struct, catalogues.CATALOGUE["peak_torque"].unit):
+            if key.name in table and key.unit and not isinstance(table[key.name], dict):
+                table[key.name] = times(table[key.name], key.unit)
+
+    for name, table in scaled.items():
+        kinds = layout.get(name)
+        if name == "requirements":
+            entries = {**catalogues.CATALOGUE, **catalogues.MARGINS}
+            units = {metric: entry.unit for metric, entry in entries.items()}
+            for metric, value in table.items():
+                if isinstance(value, dict):
+                    value["limit"] = times(value["limit"], units[metric])
+                else:
+                    table[metric] = times(value, units[metric])
+        elif name == "tune":
+            units = gain_names.units(plant)
+            for gain, interval in table.get("bounds", {}).items():
+                table["bounds"][gain] = times(interval, units[gain].replace("1/s^(2-p)", "-").replace("1/s^p", "-"))
+        elif name == "dispersion":
+            for key, one in table.items():
+                of(one, layouts.DISPERSIONS[key][one["kind"]])
+        elif name == "disturbance" and table.get("kind") == "sum":
+            for term in table["terms"]:
+                of(term, layout["disturbance"][term["kind"]])
+        elif kinds is not None:
+            of(table, kinds[table.get("kind", next(iter(kinds)))] if isinstance(kinds, Mapping) else kinds)
+    return scaled
+
 
 SATELLITES = {
     path.stem: tomllib.loads(path.read_text()) for path in sorted((ROOT / "benchmarks" / "satellites").glob("*.toml"))
@@ -107,3 +175,34 @@ def test_every_gain_has_a_unit_with_a_list_of_sensors_too():
     gyro = {"kind": "gyro", "rate_noise_density": 1e-5, "rate_bias_walk": 1e-7}
     here = from_tables({**raw, "sensors": [star, gyro]})
     assert set(here.gains) <= set(gain_names.units_of(here))
+
+
+def small_search_of(name: str, *, margins: bool) -> dict[str, Any]:
+    """Return the tables of a satellite with a small search. Requirements on margins take long to compile."""
+    raw = SATELLITES[name]
+    kept = {key: value for key, value in raw["requirements"].items() if margins or key not in catalogues.MARGINS}
+    return {**raw, "requirements": kept, "tune": {"trials": 8, "starts": 3, "steps": 8}}
+
+
+@pytest.mark.long  # compilation takes minutes; the tests above check defaults and bounds
+@pytest.mark.parametrize(("name", "margins"), [("cubetas", False), ("sixu", False), ("microsat", True)])
+def test_other_units_rescale_the_tuned_gains_and_change_nothing_else(name, margins):
+    """Gains are reported with 10 digits and agree to 1e-9. Single trials amplify this rounding."""
+    tables, inertia, time = small_search_of(name, margins=margins), 4.0, 16.0
+    here, there = (
+        tuner.tune(from_tables(one), 0, with_checks=False) for one in (tables, in_units(tables, inertia, time))
+    )
+    units = gain_names.units_of(here.tuned)
+    for gain, value in here.gains.items():
+        mass, second = powers(units[gain_names.base(gain)])
+        assert there.gains[gain] == pytest.approx(value * inertia**mass * time**second, rel=1e-9), gain
+    assert there.rollouts == here.rollouts
+    assert there.gradients == here.gradients
+    assert there.search.value == pytest.approx(here.search.value, rel=1e-9)
+    for metric in ("window_error", "terminal_angle", "saturated"):
+        one, other = (np.asarray(getattr(run.held_out["tuned"].metrics, metric)) for run in (here, there))
+        np.testing.assert_allclose(other, one, rtol=1e-7)
+    torque = inertia * time**-2.0
+    one, other = (np.asarray(run.held_out["tuned"].metrics.peak_torque) for run in (here, there))
+    np.testing.assert_allclose(other, torque * one, rtol=1e-7)
+    np.testing.assert_array_equal(here.held_out["tuned"].status, there.held_out["tuned"].status)
