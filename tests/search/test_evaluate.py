@@ -19,6 +19,15 @@ from tuning.search.normalisation import Bounds
 from tuning.search.objective import FAILED, Rules, judge, problem
 
 
+def with_margins(monkeypatch, simulated, of_loop, objective):
+    """Return the measurement at two points whose metrics have these constraints, and whose margins have those."""
+    monkeypatch.setattr(evaluate.margin_rows, "constraints_at_points", lambda margins, scale, normalised: of_loop)
+    some: Any = SimpleNamespace(margins=object(), objective=objective)
+    evaluator, at = Evaluator(Bounds(("eta", "delta"), (2.0, 0.1), (3.0, 1.0))), np.array([[0.0, 0.0], [1.0, 1.0]])
+    rest = {"gains": at, "f": np.zeros(2), "value": np.zeros(2), "f_gradient": np.zeros((2, 2))}
+    return MeasurementWithGradients(**evaluator._evaluate(lambda problem, at: {**rest, **simulated}, some, at))
+
+
 @pytest.mark.parametrize(("trials", "loops"), [(2, 5), (5, 2)])
 def test_rows_of_trials_and_of_margins_are_padded_without_changing_the_result(monkeypatch, trials, loops):
     """Two limits have entries for each trial, and one margin has entries for each loop. Padding is c = -1.
@@ -28,14 +37,7 @@ def test_rows_of_trials_and_of_margins_are_padded_without_changing_the_result(mo
     rng = np.random.default_rng(0)
     simulated = {"c": rng.uniform(-0.9, -0.5, (2, 2, trials)), "c_gradient": rng.normal(size=(2, 2, trials, 2))}
     of_loop = {"c": rng.uniform(-0.9, -0.5, (2, 1, loops)), "c_gradient": rng.normal(size=(2, 1, loops, 2))}
-    normalised = np.array([[0.0, 0.0], [1.0, 1.0]])
-    monkeypatch.setattr(evaluate.margin_rows, "constraints_at_points", lambda margins, bounds, normalised: of_loop)
-    some: Any = SimpleNamespace(margins=object(), objective="window_error")
-    evaluator = Evaluator(Bounds(("eta", "delta"), (2.0, 0.1), (3.0, 1.0)))
-    rest = {"gains": normalised, "f": np.zeros(2), "value": np.zeros(2), "f_gradient": np.zeros((2, 2))}
-    found = MeasurementWithGradients(
-        **evaluator._evaluate(lambda problem, normalised: {**rest, **simulated}, some, normalised)
-    )
+    found = with_margins(monkeypatch, simulated, of_loop, "window_error")
     assert found.c.shape == (2, 3, 5)
     for name, filled in (("c", -1.0), ("c_gradient", 0.0)):
         seen = getattr(found, name)
@@ -105,14 +107,7 @@ def test_goal_limits_includes_the_margins(monkeypatch):
     """F and its gradient follow the largest row: a metric's at the first point, a margin's at the second point."""
     simulated = {"c": np.array([[[0.3, -0.2]], [[-0.5, -0.4]]]), "c_gradient": np.arange(8.0).reshape(2, 1, 2, 2)}
     of_loop = {"c": np.array([[[-0.1]], [[0.6]]]), "c_gradient": 10.0 + np.arange(4.0).reshape(2, 1, 1, 2)}
-    monkeypatch.setattr(evaluate.margin_rows, "constraints_at_points", lambda margins, scale, normalised: of_loop)
-    some: Any = SimpleNamespace(margins=object(), objective="limits")
-    evaluator = Evaluator(Bounds(("eta", "delta"), (2.0, 0.1), (3.0, 1.0)))
-    normalised = np.zeros((2, 2))
-    rest = {"gains": normalised, "f": np.zeros(2), "value": np.zeros(2), "f_gradient": np.zeros((2, 2))}
-    found = MeasurementWithGradients(
-        **evaluator._evaluate(lambda problem, normalised: {**rest, **simulated}, some, normalised)
-    )
+    found = with_margins(monkeypatch, simulated, of_loop, "limits")
     np.testing.assert_allclose(np.exp(found.f), [1.3, 1.6], rtol=1e-12)
     np.testing.assert_array_equal(found.value, found.f)
     np.testing.assert_allclose(found.f_gradient, [[0.0, 1.0 / 1.3], [12.0 / 1.6, 13.0 / 1.6]], rtol=1e-12)

@@ -153,59 +153,56 @@ def test_a_search_starts_from_the_best_design_if_that_is_better_than_the_scenari
         np.testing.assert_allclose(evaluate.bounds.gains(run.history[0].gains), first, rtol=1e-12)
 
 
-class Narrow(Evaluator):
-    """F = (delta - 1.1)^2 for delta < 2, else F = 1 + (delta - 3.5)^2.
+class OfDelta(Evaluator):
+    """Evaluates F and the largest c of every trial, which are functions of delta."""
 
-    The period is 0.2 s. If delta < 2, a limit is broken within 0.3 periods of each sample.
-    """
+    def __init__(self, f_and_c):
+        super().__init__(normalisation.Bounds(("delta",), (0.2,), (5.0,)))
+        self._f_and_c = f_and_c
 
     def measure_with_gradients(self, problem, normalised):
-        gains = np.asarray(jax.vmap(self.bounds.gains)(jnp.asarray(normalised)))
-        by_share = np.asarray(jax.vmap(jax.jacfwd(self.bounds.gains))(jnp.asarray(normalised)))[:, 0, 0]
-        delta = gains[:, 0]
-        near, off = delta < 2.0, np.abs(delta / 0.2 - np.round(delta / 0.2))
-        f = np.where(near, (delta - 1.1) ** 2, 1.0 + (delta - 3.5) ** 2)
-        f_gradient = 2.0 * np.where(near, delta - 1.1, delta - 3.5) * by_share
-        broken = np.where(near, 0.3 - off, -1.0)[:, None, None]
-        shape = (len(normalised), 1, problem.trials.size)
-        return MeasurementWithGradients(
-            gains, f, np.broadcast_to(broken, shape), f, f_gradient[:, None], np.zeros((*shape, 1))
-        )
+        def values(share):
+            return jnp.stack(self._f_and_c(self.bounds.gains(share)[0]))
+
+        shares = jnp.asarray(normalised)
+        f, c = np.asarray(jax.vmap(values)(shares)).T
+        f_slope, c_slope = np.asarray(jax.vmap(jax.jacfwd(values))(shares))[:, :, 0].T
+        c, c_slope = (np.tile(v[:, None, None], (1, 1, problem.trials.size)) for v in (c, c_slope))
+        gains = np.asarray(jax.vmap(self.bounds.gains)(shares))
+        return MeasurementWithGradients(gains, f, c, f, f_slope[:, None], c_slope[..., None])
 
     measure = measure_with_gradients
+
+
+def narrow(delta):
+    """Return (delta - 1.1)^2 for delta < 2, else 1 + (delta - 3.5)^2, and c, without its derivative.
+
+    The period is 0.2 s. If delta < 2, the limit is broken within 0.3 periods of each sample.
+    """
+    near, off = delta < 2.0, jnp.abs(delta / 0.2 - jnp.round(delta / 0.2))
+    f = jnp.where(near, (delta - 1.1) ** 2, 1.0 + (delta - 3.5) ** 2)
+    return f, jax.lax.stop_gradient(jnp.where(near, 0.3 - off, -1.0))
 
 
 def test_another_local_search_is_used_if_the_hand_over_on_a_sample_breaks_a_limit():
     """The search would otherwise end with gains that break a limit, although it has found gains that meet it."""
     some = replace(problem(peak_torque=1.0), names=("delta",))
-    evaluate = Narrow(normalisation.Bounds(("delta",), (0.2,), (5.0,)))
+    evaluate = OfDelta(narrow)
     run = local_searches.LocalSearches(evaluate, 0.0, 20, np.random.default_rng(0))
     run.search_locally(some, {k: evaluate.bounds.normalise(np.array([delta])) for k, delta in enumerate((1.1, 3.5))})
     assert run.best.violation == 0.0
     np.testing.assert_allclose(run.best.f, 1.01, rtol=1e-6)  # on the samples next to 3.5 s
 
 
-class Rippled(Evaluator):
-    """F = 0.02 (delta - 1.8)^2 + 0.01 (1 - cos(2 pi delta / 0.6)), with the limit c = 1.7 - delta."""
-
-    def measure_with_gradients(self, problem, normalised):
-        gains = np.asarray(jax.vmap(self.bounds.gains)(jnp.asarray(normalised)))
-        by_share = np.asarray(jax.vmap(jax.jacfwd(self.bounds.gains))(jnp.asarray(normalised)))[:, 0, 0]
-        delta, rate = gains[:, 0], 2 * np.pi / 0.6
-        f = 0.02 * (delta - 1.8) ** 2 + 0.01 * (1 - np.cos(rate * delta))
-        f_gradient = (0.04 * (delta - 1.8) + 0.01 * rate * np.sin(rate * delta)) * by_share
-        shape = (len(normalised), 1, problem.trials.size)
-        violation, slope = (np.broadcast_to(v[:, None, None], shape) for v in (1.7 - delta, -by_share))
-        return MeasurementWithGradients(gains, f, violation, f, f_gradient[:, None], slope[..., None])
-
-    measure = measure_with_gradients
+def rippled(delta):
+    return 0.02 * (delta - 1.8) ** 2 + 0.01 * (1.0 - jnp.cos(2.0 * jnp.pi / 0.6 * delta)), 1.7 - delta
 
 
 @pytest.mark.parametrize("delta", [3.0, 4.8])
 def test_a_search_finds_the_best_local_minimum_among_ripples_over_delta(delta):
     """Two searches that differed only in rounding once ended 2.4 % apart, in different ripples."""
     some = replace(problem(peak_torque=1.0), names=("delta",))
-    evaluate = Rippled(normalisation.Bounds(("delta",), (0.2,), (5.0,)))
+    evaluate = OfDelta(rippled)
     run = local_searches.LocalSearches(evaluate, 0.0, 20, np.random.default_rng(0))
     run.search_locally(some, {0: evaluate.bounds.normalise(np.array([delta]))})
     np.testing.assert_allclose(run.gains, 1.8, rtol=1e-9)
