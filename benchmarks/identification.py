@@ -49,7 +49,7 @@ def main() -> None:
     })  # fmt: skip
     logs = [telemetry.measurements(loaded, frame, f"log {k}") for k, frame in enumerate(frames)]
     problem = parameters.build(loaded, logs)
-    gate = estimation._innovation_gate(loaded)
+    gate = estimation.innovation_gate(loaded.identify.outliers)
     search = estimation.Search(problem, [], gate, lambda text: None)
     zero = np.zeros(problem.size)
     truth = problem.numbers(zero)

@@ -20,10 +20,11 @@ from scipy import stats
 from ptsmc_jax import configure
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.identification import filtering, parameters
-from ptsmc_jax.identification.filtering import Innovations, LogKind, Model, Rows, Track
+from ptsmc_jax.identification.filtering import FilterState, Innovations, LogKind, Model, Rows
 from ptsmc_jax.identification.parameters import Problem
 from ptsmc_jax.identification.telemetry import Measurements
 from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.scenario.identify_tables import Identify
 from ptsmc_jax.scenario.tables import Scenario
 
 ROW_MULTIPLE = 256  # rows of a log are padded to a multiple of it, so that similar logs share compiled programs
@@ -55,7 +56,7 @@ class Fit:
     log: Measurements
     rows: Rows
     innovations: Innovations  # arrays (rows - 1, components)
-    track: Track
+    track: FilterState  # estimates at each row but the first
     adjusted: Innovations | None = None
     distance: float = 0.0  # distance of this log's own most likely parameters from the estimates, RMS in sigmas
 
@@ -86,7 +87,14 @@ class Fit:
 
         Lags are counted in readings of the component.
         """
-        return np.stack([_autocorrelate(column[np.isfinite(column)]) for column in self.whitened.T], axis=1)
+
+        def autocorrelate(values: np.ndarray) -> np.ndarray:
+            if values.size <= LAGS:
+                return np.zeros(LAGS)
+            products = [np.sum(values[lag:] * values[:-lag]) for lag in range(1, LAGS + 1)]
+            return np.array(products) / np.sum(values**2)
+
+        return np.stack([autocorrelate(column[np.isfinite(column)]) for column in self.whitened.T], axis=1)
 
     @property
     def is_white(self) -> bool:
@@ -100,13 +108,6 @@ class Fit:
         low, high = MEAN_SQUARE_RANGE
         is_consistent = min(low, 1.0 - spread) < self.mean_square < max(high, 1.0 + spread)
         return is_consistent and self.distance < MAX_DISTANCE and bool(np.all(np.abs(self.autocorrelation()) < bound))
-
-
-def _autocorrelate(values: np.ndarray) -> np.ndarray:
-    if values.size <= LAGS:
-        return np.zeros(LAGS)
-    total = np.sum(values**2)
-    return np.array([np.sum(values[lag:] * values[:-lag]) for lag in range(1, LAGS + 1)]) / total
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,14 +135,10 @@ class Identification:
         return np.sqrt(np.diag(self.covariance))
 
     @property
-    def is_white(self) -> bool:
-        """Whether the innovations of all logs are consistent and white."""
-        return all(fit.is_white for fit in [*self.fits, *self.validation])
-
-    @property
     def is_identified(self) -> bool:
         """Whether the model explains the logs, and data and prior knowledge determine every free parameter."""
-        return self.converged and self.is_white and self.is_determined
+        explains_logs = all(fit.is_white for fit in [*self.fits, *self.validation])
+        return self.converged and explains_logs and self.is_determined
 
     def table(self) -> pl.DataFrame:
         """Return a row for each number: estimate, 1 sigma, 95 % interval, start, prior 1 sigma and unit."""
@@ -156,11 +153,10 @@ class Identification:
         """Return the gyro bias at the end of each log and its 1 sigma, (3,) each [rad/s]."""
         if not self.problem.has_gyro_bias:
             return []
-        walk_size = self.problem.model.walk_density.size if self.problem.model.walk_density is not None else 0
         biases = []
         for fit in self.fits:
             variances = np.diag(fit.track.covariance[-1])
-            first = len(variances) - walk_size - 3
+            first = len(variances) - fit.track.walk.shape[1] - 3
             biases.append((fit.track.bias[-1], np.sqrt(variances[first : first + 3])))
         return biases
 
@@ -188,34 +184,28 @@ def estimate_parameters(
         free: names of the free parameters; by default those of [identify].
         report: called with the progress in words.
     """
-    _check_same_readings([*logs, *validation_logs])
-    problem = parameters.build(loaded, logs, free)
-    search = Search(problem, [prepare_log(problem, log) for log in logs], _innovation_gate(loaded), report)
+    first = logs[0]
+    for log in [*logs, *validation_logs]:
+        if (set(log.readings), _log_kind(log)) != (set(first.readings), _log_kind(first)):
+            raise ScenarioError(f"{log.name} has other readings than {first.name}, but all logs must have the same")
+    problem, table = parameters.build(loaded, logs, free), loaded.identify or Identify()
+    search = Search(problem, [prepare_log(problem, log) for log in logs], innovation_gate(table.outliers), report)
     largest_acceleration = max(parameters.commanded_acceleration(problem.model, log) for log in logs)
-    max_starts = 3 if loaded.identify is None else loaded.identify.starts
-    best = search.find_best(np.zeros(problem.size), largest_acceleration, max_starts)
+    best = search.find_best(np.zeros(problem.size), largest_acceleration, table.starts)
     return _build_result(loaded, problem, search, best, logs, validation_logs)
 
 
-def _check_same_readings(logs: Sequence[Measurements]) -> None:
-    """Raise ScenarioError if logs have different readings or commands."""
-    first = logs[0]
-    for log in logs[1:]:
-        is_same = (set(log.readings), log.by_channel, log.wheel_inertia) == (
-            set(first.readings), first.by_channel, first.wheel_inertia
-        )  # fmt: skip
-        if not is_same:
-            raise ScenarioError(f"{log.name} has other readings than {first.name}, but all logs must have the same")
+def _log_kind(log: Measurements) -> LogKind:
+    return LogKind(log.by_channel, log.wheel_inertia)
 
 
 def prepare_log(problem: Problem, log: Measurements) -> PreparedLog:
     """Return the rows of a log for the filter, and their structure."""
-    return filtering.make_rows(log, problem.max_step, ROW_MULTIPLE), LogKind.from_log(log)
+    return filtering.make_rows(log, problem.max_step, ROW_MULTIPLE), _log_kind(log)
 
 
-def _innovation_gate(loaded: Scenario) -> float:
-    """Return the largest accepted mean normalised square of the innovations of a group of readings [-]."""
-    rate = 1e-6 if loaded.identify is None else loaded.identify.outliers
+def innovation_gate(rate: float) -> float:
+    """Return the mean normalised square [-] that correct readings exceed with this probability, infinity for 0."""
     return float(stats.chi2.isf(rate, 3) / 3.0) if rate > 0.0 else np.inf
 
 
@@ -239,18 +229,19 @@ class Search:
         self.prior_weight = problem.has_prior().astype(float)
         self._noise_is_free = any(parameter.name.endswith("_noise") for parameter in problem.parameters)
         self.acceleration_noise = jnp.zeros(())
-        self._jitted_filter = jax.jit(self._run_filter, static_argnames="kind")
-        self._jitted_innovations = jax.jit(self._innovations, static_argnames="kind")
+        self._jitted_filter = jax.jit(
+            lambda z, rows, kind: filtering.run_filter(problem.model_at(z), rows, kind), static_argnames="kind"
+        )
+        self._jitted_innovations = jax.jit(
+            lambda z, noise, rows, gate, kind: filtering.run_filter(
+                self._model_at(z, noise), rows, kind, gate, with_track=False
+            )[0],
+            static_argnames="kind",
+        )
         self._jitted_derivatives = jax.jit(self._differentiate, static_argnames=("kind", "exact"))
 
     def _model_at(self, z: Array, noise: Array) -> Model:
         return replace(self.problem.model_at(z), acceleration_noise=noise)
-
-    def _run_filter(self, z: Array, rows: Rows, kind: LogKind) -> tuple[Innovations, Any]:
-        return filtering.run_filter(self.problem.model_at(z), rows, kind)
-
-    def _innovations(self, z: Array, noise: Array, rows: Rows, gate: Any, kind: LogKind) -> Innovations:
-        return filtering.innovations(self._model_at(z, noise), rows, kind, gate)
 
     def _differentiate(
         self, z: Array, noise: Array, rows: Rows, kind: LogKind, exact: bool
@@ -258,7 +249,9 @@ class Search:
         """Return log-likelihood, gradient, Fisher information and mean normalised square of one log."""
 
         def innovations_at(z: Array) -> tuple[tuple[Array, Array], Innovations]:
-            innovations = filtering.innovations(self._model_at(z, noise), rows, kind, covariance_derivatives=exact)
+            innovations, _ = filtering.run_filter(
+                self._model_at(z, noise), rows, kind, with_track=False, covariance_derivatives=exact
+            )
             return (innovations.value, innovations.variance), innovations
 
         def differentiate_along(directions: Array) -> Any:  # the part of one device
@@ -279,9 +272,11 @@ class Search:
         information = jnp.einsum("kmi,kmj->ij", by_value, by_value)
         information = information + 0.5 * jnp.einsum("kmi,kmj->ij", by_variance, by_variance)
         count = jnp.maximum(jnp.sum(accepted), 1)
-        return _log_likelihood(value, variance, accepted), gradient, information, jnp.sum(whitened**2) / count
+        # without the constant
+        log_likelihood = -0.5 * jnp.sum(jnp.where(accepted, value**2 / variance + jnp.log(variance), 0.0))
+        return log_likelihood, gradient, information, jnp.sum(whitened**2) / count
 
-    def run_filter(self, z: np.ndarray, log: PreparedLog) -> tuple[Innovations, Track]:
+    def run_filter(self, z: np.ndarray, log: PreparedLog) -> tuple[Innovations, FilterState]:
         """Return innovations and estimates of the filter for a log, as NumPy arrays."""
         rows, kind = log
         return jax.tree.map(np.asarray, self._jitted_filter(jnp.asarray(z), _to_jax(rows), kind=kind))
@@ -419,11 +414,6 @@ def _is_finite(derivatives: tuple[float, np.ndarray, np.ndarray, float]) -> bool
     return all(bool(np.all(np.isfinite(one))) for one in derivatives)
 
 
-def _log_likelihood(value: Any, variance: Any, accepted: Any) -> Any:
-    """Return the log-likelihood of the innovations, without the constant."""
-    return -0.5 * jnp.sum(jnp.where(accepted, value**2 / variance + jnp.log(variance), 0.0))
-
-
 def _to_jax(rows: Rows) -> Rows:
     """Return the rows as arrays for JAX; `log_row` is not used there."""
     return jax.tree.map(jnp.asarray, rows._replace(log_row=np.zeros(0)))
@@ -448,11 +438,10 @@ def describe_undetermined(problem: Problem, information: np.ndarray, by_z: np.nd
     for direction in directions[:, sizes < 1.0].T:
         change = (by_z @ direction) / np.where(usual_change > 0.0, usual_change, 1.0)
         is_large = np.abs(change) > MIN_COMPONENT * np.max(np.abs(change))
-        names, common, coordinate, number = [], [], 0, 0
-        for parameter in problem.parameters:
-            part = direction[coordinate : coordinate + parameter.size]
-            is_label_large = is_large[number : number + len(parameter.labels)]
-            coordinate, number = coordinate + parameter.size, number + len(parameter.labels)
+        names, common = [], []
+        parts = np.split(direction, np.cumsum([parameter.size for parameter in problem.parameters])[:-1])
+        large_labels = np.split(is_large, np.cumsum([len(parameter.labels) for parameter in problem.parameters])[:-1])
+        for parameter, part, is_label_large in zip(problem.parameters, parts, large_labels, strict=True):
             if np.linalg.norm(part) < MIN_COMPONENT:
                 continue
             factor = parameter.common
@@ -485,13 +474,12 @@ def _build_result(
     prior_std = np.sqrt(np.sum(by_start[:, has_prior] ** 2, axis=1))
     prior_std = np.where(np.any(by_start[:, ~has_prior] != 0.0, axis=1) | (prior_std == 0.0), np.inf, prior_std)
 
-    def fit_log(log: Measurements) -> tuple[Fit, PreparedLog]:
+    def fit_log(log: Measurements, is_validation: bool = False) -> Fit:
         prepared = prepare_log(problem, log)
         screened = search.reject_outliers(z, prepared)
-        return Fit(log, prepared[0], *search.run_filter(z, screened)), screened
-
-    def predict_log(log: Measurements) -> Fit:
-        fit, screened = fit_log(log)
+        fit = Fit(log, prepared[0], *search.run_filter(z, screened))
+        if not is_validation:
+            return fit
         _, gradient, information, _ = search.derivatives(z, [screened])
         weight, prior_information = search.prior_weight, np.linalg.pinv(z_covariance)  # the estimate is the prior
         step = np.linalg.solve(information - np.diag(weight) + prior_information, gradient + weight * z)
@@ -508,8 +496,8 @@ def _build_result(
         covariance=by_z @ z_covariance @ by_z.T,
         undetermined=describe_undetermined(problem, best.information - np.diag(search.prior_weight), by_start),
         is_determined=bool(np.min(np.linalg.eigvalsh(best.information)) >= 1.0),
-        fits=[fit_log(log)[0] for log in logs],
-        validation=[predict_log(log) for log in validation_logs],
+        fits=[fit_log(log) for log in logs],
+        validation=[fit_log(log, is_validation=True) for log in validation_logs],
         converged=best.converged,
         steps=best.steps,
         log_likelihood=best.log_likelihood,

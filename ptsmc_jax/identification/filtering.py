@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ptsmc_jax.campaigns.store import RefusedError
-from ptsmc_jax.devices.actuators import Actuators, ActuatorState, Drive
+from ptsmc_jax.devices.actuators import Actuators, Drive
 from ptsmc_jax.identification.telemetry import Measurements
 from ptsmc_jax.numerics import attitude, guards, integrators, matrices
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
@@ -71,21 +71,14 @@ class Innovations(NamedTuple):
     accepted: Any  # bool: there is a reading, and it is no outlier
 
 
-class Track(NamedTuple):
-    """Estimates of the filter after each row but the first."""
+class FilterState(NamedTuple):
+    """Estimates and covariance of the filter at a row, or at many rows with a leading axis."""
 
     x: Any  # state of the plant
-    bias: Any  # (rows, 3) [rad/s]
-    walk: Any  # (rows, m) [N m]
-    covariance: Any  # (rows, n, n)
-
-
-class _Carry(NamedTuple):
-    x: Any
-    bias: Any
-    walk: Any
-    p: Any
-    actuators: ActuatorState
+    bias: Any  # (3,) gyro bias [rad/s]
+    walk: Any  # (m,) random-walk torque [N m]
+    covariance: Any  # (n, n) of the errors of state, bias and torque
+    actuators: Any  # `ActuatorState`; None in a stored track
 
 
 def make_rows(log: Measurements, step: float, bucket: int = 1) -> Rows:
@@ -168,11 +161,6 @@ class LogKind(NamedTuple):
     by_channel: bool
     wheel_inertia: float | None
 
-    @staticmethod
-    def from_log(log: Measurements) -> "LogKind":
-        """Return the structure of a log."""
-        return LogKind(log.by_channel, log.wheel_inertia)
-
 
 def use_wheel_speeds(model: Model, wheel_inertia: float | None) -> Model:
     """Return the model of a log that has wheel speeds instead of commands; None returns the model unchanged.
@@ -190,13 +178,6 @@ def use_wheel_speeds(model: Model, wheel_inertia: float | None) -> Model:
     return replace(model, plant=plant, actuators=actuators)
 
 
-def innovations(
-    model: Model, rows: Rows, kind: LogKind, gate: Any = jnp.inf, *, covariance_derivatives: bool = True
-) -> Innovations:
-    """Return the prediction errors of a log; see `run_filter`."""
-    return run_filter(model, rows, kind, gate, with_track=False, covariance_derivatives=covariance_derivatives)[0]
-
-
 def run_filter(
     model: Model,
     rows: Rows,
@@ -205,7 +186,7 @@ def run_filter(
     *,
     with_track: bool = True,
     covariance_derivatives: bool = True,
-) -> tuple[Innovations, Track | None]:
+) -> tuple[Innovations, FilterState | None]:
     """Return the prediction errors of a log and the estimates of the filter.
 
     Args:
@@ -220,12 +201,12 @@ def run_filter(
     acting = acting_command(model, rows, kind.wheel_inertia)
     carry = _initial_carry(model, rows)
 
-    def step(carry: _Carry, row: Any) -> tuple[_Carry, tuple[Innovations, Track | None]]:
+    def step(carry: FilterState, row: Any) -> tuple[FilterState, tuple[Innovations, FilterState | None]]:
         t, dt, command, acting, readings, valid = row
         carry = _predict(model, carry, t, dt, command, acting, kind)
-        carry = carry if covariance_derivatives else carry._replace(p=jax.lax.stop_gradient(carry.p))
+        carry = carry if covariance_derivatives else carry._replace(covariance=jax.lax.stop_gradient(carry.covariance))
         carry, errors = _correct(model, carry, readings, valid, gate)
-        return carry, (errors, Track(carry.x, carry.bias, carry.walk, carry.p) if with_track else None)
+        return carry, (errors, carry._replace(actuators=None) if with_track else None)
 
     inputs = rows.t[:-1], rows.dt[:-1], rows.command[:-1], acting[:-1]
     next_readings = jax.tree.map(lambda v: v[1:], (rows.readings, rows.valid))
@@ -233,7 +214,7 @@ def run_filter(
     return outputs
 
 
-def _initial_carry(model: Model, rows: Rows) -> _Carry:
+def _initial_carry(model: Model, rows: Rows) -> FilterState:
     """Return the filter at the first row. Its readings determine the state, which has no other prior knowledge."""
     readings = jax.tree.map(lambda v: v[0], rows.readings)
     walk = jnp.zeros(model.plant.inputs if model.walk_density is not None else 0)
@@ -241,7 +222,7 @@ def _initial_carry(model: Model, rows: Rows) -> _Carry:
     if not model.is_spacecraft:
         x = model.plant.with_hidden_at_rest(readings["x"])
         p = jnp.diag(jnp.concatenate([model.noises["x"] ** 2, model.hidden_sigma**2, jnp.zeros_like(walk)]))
-        return _Carry(x, jnp.zeros(0), walk, p, actuators)
+        return FilterState(x, jnp.zeros(0), walk, p, actuators)
     inverse_turn = attitude.from_rotation_vector(-model.misalignment)
     identity = jnp.array([0.0, 0.0, 0.0, 1.0])
     q = attitude.multiply(readings["attitude"], inverse_turn) if "attitude" in readings else identity
@@ -261,7 +242,7 @@ def _initial_carry(model: Model, rows: Rows) -> _Carry:
     rate_bias_covariance = jnp.diag(jnp.where(has_rate, -bias_variance / model.rate_scale, 0.0))
     p = p.at[3:6, n : n + 3].set(rate_bias_covariance).at[n : n + 3, 3:6].set(rate_bias_covariance)
     x = model.plant.with_hidden_at_rest(AttitudeState(q, w))
-    return _Carry(x, jnp.zeros(3), walk, p, actuators)
+    return FilterState(x, jnp.zeros(3), walk, p, actuators)
 
 
 def _rotation_matrix(rotation_vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
@@ -271,8 +252,8 @@ def _rotation_matrix(rotation_vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
 
 
 def _predict(
-    model: Model, carry: _Carry, t: Scalar, dt: Scalar, command: Array, acting: Array, kind: LogKind
-) -> _Carry:
+    model: Model, carry: FilterState, t: Scalar, dt: Scalar, command: Array, acting: Array, kind: LogKind
+) -> FilterState:
     """Return the filter after an interval, before the readings at its end."""
     plant, actuators = model.plant, model.actuators
     if kind.wheel_inertia is not None:  # the wheels' momentum is measured
@@ -291,7 +272,7 @@ def _predict(
     after = integrators.rk4(lambda time, y: state_rate(time, y, carry.walk), t, carry.x, dt, rolled=True)
     after = plant.normalise(after)
     m, b = carry.walk.size, carry.bias.size
-    n = carry.p.shape[0] - b - m
+    n = carry.covariance.shape[0] - b - m
     transition = _transition_matrix(plant, state_rate, carry, after, t, dt)
     f = jnp.eye(n + b + m).at[:n, :n].set(transition[:n, :n])
     f = f.at[:n, n + b :].set(transition[:n, n:]) if m else f
@@ -305,12 +286,12 @@ def _predict(
     noise = [jnp.zeros(velocity), model.acceleration_noise**2 * dt * noise_factors]
     noise += [model.bias_walk**2 * dt * jnp.ones(b)]
     noise += [jnp.broadcast_to(model.walk_density**2 * dt, (m,))] if m else []
-    p = f @ (carry.p + jnp.diag(jnp.concatenate(noise))) @ f.T
+    p = f @ (carry.covariance + jnp.diag(jnp.concatenate(noise))) @ f.T
     state = carry.actuators if kind.wheel_inertia is not None else actuators.end(carry.actuators, drive, None, dt)
-    return carry._replace(x=after, p=p, actuators=state)
+    return carry._replace(x=after, covariance=p, actuators=state)
 
 
-def _transition_matrix(plant: Any, rate: Any, carry: _Carry, after: Any, t: Scalar, dt: Scalar) -> Array:
+def _transition_matrix(plant: Any, rate: Any, carry: FilterState, after: Any, t: Scalar, dt: Scalar) -> Array:
     """Return the transition matrix of the state and the random-walk torque over an interval.
 
     It is e^(A dt) to fourth order. A has the derivatives of the rate of the local coordinates in the middle of the
@@ -319,7 +300,7 @@ def _transition_matrix(plant: Any, rate: Any, carry: _Carry, after: Any, t: Scal
     middle = plant.retract(carry.x, 0.5 * plant.local_coordinates(carry.x, after))
     time, m = t + dt / 2, carry.walk.size
     middle_rate = rate(time, middle, carry.walk)
-    n = carry.p.shape[0] - carry.bias.size - m
+    n = carry.covariance.shape[0] - carry.bias.size - m
 
     def local_rate(offset: Array) -> Array:
         shifted = plant.retract(middle, offset[:n])
@@ -334,11 +315,11 @@ def _transition_matrix(plant: Any, rate: Any, carry: _Carry, after: Any, t: Scal
 
 
 def _correct(
-    model: Model, carry: _Carry, readings: dict[str, Array], valid: Array, gate: Any
-) -> tuple[_Carry, Innovations]:
+    model: Model, carry: FilterState, readings: dict[str, Array], valid: Array, gate: Any
+) -> tuple[FilterState, Innovations]:
     """Return the filter corrected by the readings of a row, one component after the other, and the innovations."""
     residuals, derivatives, noise = _compute_residuals(model, carry, readings)
-    correction, p = jnp.zeros(carry.p.shape[0]), carry.p
+    correction, p = jnp.zeros(carry.covariance.shape[0]), carry.covariance
     values, variances, accepted_components = [], [], []
     size = 1 if "x" in readings else 3  # components that are rejected together
     for begin in range(0, residuals.size, size):
@@ -361,7 +342,7 @@ def _correct(
     n = p.shape[0] - carry.bias.size - carry.walk.size
     state_correction, bias_correction, walk_correction = jnp.split(correction, [n, n + carry.bias.size])
     x = model.plant.normalise(model.plant.retract(carry.x, state_correction))
-    corrected = carry._replace(x=x, bias=carry.bias + bias_correction, walk=carry.walk + walk_correction, p=p)
+    corrected = carry._replace(x=x, bias=carry.bias + bias_correction, walk=carry.walk + walk_correction, covariance=p)
     accepted = jnp.stack(accepted_components)
     # missing and rejected readings have an innovation of 0 with variance 1, so that they do not change the likelihood
     errors = Innovations(
@@ -370,9 +351,9 @@ def _correct(
     return corrected, errors
 
 
-def _compute_residuals(model: Model, carry: _Carry, readings: dict[str, Array]) -> tuple[Array, Array, Array]:
+def _compute_residuals(model: Model, carry: FilterState, readings: dict[str, Array]) -> tuple[Array, Array, Array]:
     """Return readings minus predictions (m,), their derivatives by the state of the filter (m, n), and their noise."""
-    n = carry.p.shape[0]
+    n = carry.covariance.shape[0]
     if not model.is_spacecraft:
         predicted = model.plant.visible(carry.x)
         return readings["x"] - predicted, jnp.eye(predicted.size, n), model.noises["x"]

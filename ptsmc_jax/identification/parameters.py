@@ -20,11 +20,12 @@ from ptsmc_jax.dispersions import numbers
 from ptsmc_jax.dispersions.quantities import PAIRS
 from ptsmc_jax.identification.filtering import Model
 from ptsmc_jax.identification.telemetry import Measurements
-from ptsmc_jax.numerics import attitude, matrices
+from ptsmc_jax.numerics import attitude, matrices, paths
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.plants.rigid_body import AttitudeState
 from ptsmc_jax.scenario import assembly
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
+from ptsmc_jax.scenario.identify_tables import Identify
 from ptsmc_jax.scenario.parsing import nearest_name_hint
 from ptsmc_jax.scenario.sensor_tables import SensorSuite
 from ptsmc_jax.scenario.tables import Scenario
@@ -33,6 +34,7 @@ from ptsmc_jax.signals import disturbances
 # parameters of sensors that only [hardware] has, and that [[sensors]] replaces
 HARDWARE_PARAMETERS = ("attitude_noise", "rate_noise", "gyro_scale", "star_tracker_misalignment")
 GYRO_BIAS = "gyro_bias"  # a state of the filter, not a constant
+NOISE_UNITS = {"attitude": "rad", "rate": "rad/s"}
 UNKNOWN_BIAS = 0.02  # 1 sigma of an unknown gyro bias [rad/s]
 USUAL_SIGMA = {  # prior 1 sigma of a parameter without a dispersion: relative, in rad, or of a damping ratio
     "inertia": 0.3, "actuator_scale": 0.1, "actuator_misalignment": 0.03, "gyro_scale": 0.02,
@@ -95,13 +97,13 @@ class Problem:
             begin += parameter.size
         return model
 
-    def read_numbers(self, model: Model) -> Array:
-        """Return the numbers of all parameters, one after another, in their units."""
-        return jnp.concatenate([jnp.zeros(0), *(jnp.ravel(parameter.read(model)) for parameter in self.parameters)])
-
     @cached_property
     def _jitted_numbers(self) -> Callable[[Array], Array]:
-        return jax.jit(lambda z: self.read_numbers(self.model_at(z)))
+        def read(z: Array) -> Array:
+            model = self.model_at(z)
+            return jnp.concatenate([jnp.ravel(parameter.read(model)) for parameter in self.parameters])
+
+        return jax.jit(read)
 
     def numbers(self, z: np.ndarray) -> np.ndarray:
         """Return the numbers of all parameters at coordinates (n,) [-], in their units."""
@@ -123,8 +125,7 @@ class Problem:
 
     def has_prior(self) -> np.ndarray:
         """Return whether each coordinate has prior knowledge, (n,) bool."""
-        blocks = [np.full(parameter.size, parameter.has_prior) for parameter in self.parameters]
-        return np.concatenate([np.zeros(0, bool), *blocks])
+        return np.concatenate([np.full(parameter.size, parameter.has_prior) for parameter in self.parameters])
 
 
 def build(scenario: Scenario, logs: Sequence[Measurements], names: Sequence[str] | None = None) -> Problem:
@@ -139,49 +140,36 @@ def build(scenario: Scenario, logs: Sequence[Measurements], names: Sequence[str]
         ScenarioError: a parameter is unknown, or the scenario does not have it.
     """
     setup = assembly.build_setup(scenario)
-    table = scenario.identify
-    stated_names = None if table is None else table.free
+    table = scenario.identify or Identify()
     has_gyro = "rate" in logs[0].readings
-    names = tuple(names or stated_names or _default_names(scenario, has_gyro))
+    usual_names = ("inertia", GYRO_BIAS)[: 1 + has_gyro] if scenario.plant.kind == "spacecraft" else ("actuator_scale",)
+    names = tuple(names or table.free or usual_names)
     interval = float(np.median(np.diff(logs[0].t)))
-    model, unknown_noises = _build_model(scenario, setup, logs, interval, GYRO_BIAS in names)
-    prior = scenario.dispersion if table is None or table.prior == "dispersion" else None
-    makers = _parameter_makers(scenario, model, logs, interval, prior)
+    model, unknown_noises = _build_model(scenario, table, setup, logs, GYRO_BIAS in names)
+    prior = scenario.dispersion if table.prior == "dispersion" else None
+    possible = _possible_parameters(scenario, model, logs, interval, prior)
     selected = []
     for name in dict.fromkeys((*names, *unknown_noises)):
-        if name in makers:
-            model, parameter = makers[name](model)
-            selected.append(parameter)
+        if name in possible:
+            selected.append(possible[name]())
         elif name != GYRO_BIAS or not has_gyro:
-            allowed_names = [*makers, *([GYRO_BIAS] if has_gyro else [])]
+            allowed_names = [*possible, *([GYRO_BIAS] if has_gyro else [])]
             raise ScenarioError(
                 f"identify.free has {name}, which this scenario does not have; {nearest_name_hint(name, allowed_names)}"
             )
     if not selected:
         raise wrong("identify.free", names, f"a list with at least one parameter besides {GYRO_BIAS}")
-    return Problem(model, selected, _longest_step(scenario, setup, interval), GYRO_BIAS in names)
-
-
-def _default_names(scenario: Scenario, has_gyro: bool) -> tuple[str, ...]:
-    if scenario.plant.kind != "spacecraft":
-        return ("actuator_scale",)
-    return ("inertia", GYRO_BIAS) if has_gyro else ("inertia",)
-
-
-def _longest_step(scenario: Scenario, setup: Any, interval: float) -> float:
-    """Return the longest integration step [s]: an interval of the log, or less for fast modes and disturbances."""
     frequencies = [float(np.max(np.asarray(getattr(setup.plant, "frequency", [0.0]))))]
-    for term in scenario.terms:
-        frequencies.append(term.largest_frequency())
-    fastest = max(frequencies)
-    return min(interval * 1.5, 0.2 / fastest if fastest > 0.0 else np.inf)
+    fastest = max([*frequencies, *(term.largest_frequency() for term in scenario.terms)])
+    max_step = min(interval * 1.5, 0.2 / fastest if fastest > 0.0 else np.inf)
+    return Problem(model, selected, max_step, GYRO_BIAS in names)
 
 
 def _build_model(
-    scenario: Any, setup: Any, logs: Sequence[Measurements], interval: float, with_bias: bool
+    scenario: Any, table: Identify, setup: Any, logs: Sequence[Measurements], with_bias: bool
 ) -> tuple[Model, list[str]]:
     """Return the model of the scenario, and the names of the noises that it does not state. These are estimated."""
-    table, devices, plant = scenario.identify, scenario.devices, setup.plant
+    devices, plant = scenario.devices, setup.plant
     actuators: Actuators = replace(setup.actuators, delay=0, spare_allocations=None, failure_times=None)
     if logs[0].by_channel:
         actuators = replace(actuators, torque_limit=None)
@@ -194,17 +182,13 @@ def _build_model(
     }
     for name, readings in logs[0].readings.items():
         if stated_noises[name]:
-            noises[name] = vector(stated_noises[name]) * jnp.ones(
-                min(readings.shape[1], 3) if name != "x" else readings.shape[1]
-            )
+            noises[name] = vector(stated_noises[name]) * jnp.ones(readings.shape[1] if name == "x" else 3)
         else:
             noises[name] = vector(np.maximum(np.mean([_estimate_noise(name, log) for log in logs], axis=0), 1e-12))
             unknown_noises.append("state_noise" if name == "x" else f"{name}_noise")
-    bias = getattr(devices, "rate_bias", None)
-    ignores_prior = table is not None and table.prior == "none"
-    stated_bias = 0.0 if bias is None else bias
+    bias = getattr(devices, "rate_bias", None) or 0.0
     walk_density: Any = setup.walk_rate if setup.walk_rate is None else setup.walk_rate * np.sqrt(period)
-    if table is not None and table.torque_walk is not None:
+    if table.torque_walk is not None:
         walk_density = vector(table.torque_walk) * jnp.ones(plant.inputs) if table.torque_walk > 0.0 else None
     model = Model(
         plant=plant,
@@ -215,7 +199,7 @@ def _build_model(
         tracker_axes=jnp.eye(3) if tracker is None else tracker.axes(),
         rate_scale=vector(getattr(devices, "gyro_scale", None) or np.ones(3)),
         misalignment=vector(np.deg2rad(getattr(devices, "star_tracker_misalignment_deg", None) or np.zeros(3))),
-        bias_sigma=vector(UNKNOWN_BIAS if with_bias and (ignores_prior or not stated_bias) else stated_bias),
+        bias_sigma=vector(UNKNOWN_BIAS if with_bias and (table.prior == "none" or not bias) else bias),
         bias_walk=vector(getattr(devices, "rate_bias_walk", None) or 0.0),
         walk_density=walk_density,
         hidden_sigma=_hidden_sigma(plant, logs),
@@ -261,172 +245,157 @@ def _hidden_sigma(plant: Any, logs: Sequence[Measurements]) -> Array:
     return vector(np.concatenate([deflection / frequency**2, deflection / frequency]))
 
 
-ParameterMaker = Callable[[Model], tuple[Model, Parameter]]
-
-
-def _parameter_makers(
+def _possible_parameters(
     scenario: Any, model: Model, logs: Sequence[Measurements], log_interval: float, prior: Any
-) -> dict[str, ParameterMaker]:
-    """Return the functions that add each possible parameter to a model, by name; see `parameter_maker`.
+) -> dict[str, Callable[[], Parameter]]:
+    """Return a function that makes each parameter of the scenario, by name.
 
     log_interval: time between two rows of the first log [s], the default prior 1 sigma of a delay.
     """
     plant, actuators = model.plant, model.actuators
     axes = np.eye(plant.inputs) if actuators.wheels is None else np.asarray(actuators.wheels.axes)
     torque = max(float(np.sqrt(np.mean(log.command**2))) for log in logs) or 1.0
-    default_sigma = {**USUAL_SIGMA, "delay": log_interval, "disturbance_bias": 0.1 * torque}
+    usual_sigma = {**USUAL_SIGMA, "delay": log_interval, "disturbance_bias": 0.1 * torque}
 
     def prior_sigma(name: str, count: int) -> tuple[np.ndarray, bool]:
         """Return the 1 sigma of each number, (count,), and whether [dispersion] gives it."""
         table: Any = getattr(prior, name, None)
         if not hasattr(table, "widths"):  # no dispersion is given, or a phase is uniform over the circle
-            return np.full(count, default_sigma["noise" if name.endswith("_noise") else name]), False
+            return np.full(count, usual_sigma["noise" if name.endswith("_noise") else name]), False
         sigmas = table.widths(count) * (1.0 if table.kind.endswith("normal") else 1.0 / np.sqrt(3.0))
         return np.maximum(sigmas, 1e-9), True
 
-    def parameter_maker(
-        name: str, get: Callable[[Model], Any], put: Callable[[Model, Array], Model], count: int, unit: str, kind: str
-    ) -> ParameterMaker:
-        """Return a function that adds a parameter to a model; see `Parameter`.
+    possible: dict[str, Callable[[], Parameter]] = {}
 
-        Args:
-            name: name of the parameter.
-            get: returns the present numbers of a model.
-            put: returns a model with other numbers.
-            count: number of numbers.
-            unit: unit of the numbers.
-            kind: effect of a coordinate c: "log" multiplies by e^c, "factor" multiplies by 1 + c, others add c.
-        """
+    def add(
+        name: str,
+        unit: str,
+        kind: str,
+        get: Callable[[Model], Any],
+        put: Callable[[Model, Array], Model],
+        count: int,
+    ) -> None:
+        """Add a parameter with these numbers; see `_number_parameter`."""
+        possible[name] = lambda: _number_parameter(name, unit, kind, model, get, put, *prior_sigma(name, count))
 
-        def make(model: Model) -> tuple[Model, Parameter]:
-            sigmas, has_prior = prior_sigma(name, count)
-            start = jnp.asarray(get(model), float) * jnp.ones(count)
+    def add_vector(name: str, unit: str, kind: str, path: str, count: int) -> None:
+        """Add the numbers at a path of the model, (count,); None stands for ones."""
 
-            def write(model: Model, c: Array) -> Model:
-                new = start * jnp.exp(c) if kind == "log" else start * (1.0 + c) if kind == "factor" else start + c
-                return put(model, new)
+        def get(model: Model) -> Any:
+            value = paths.get(model, path)
+            return 1.0 if value is None else value
 
-            common = 1.0 / sigmas if kind in ("log", "factor") else None
-            read = lambda model: jnp.asarray(get(model), float) * jnp.ones(count)  # noqa: E731
-            labels = [name] if count == 1 else [f"{name}_{k + 1}" for k in range(count)]
-            return put(model, start), Parameter(name, labels, unit, np.diag(sigmas), has_prior, write, read, common)
+        add(name, unit, kind, get, lambda model, new: paths.put(model, path, new), count)
 
-        return make
-
-    def with_actuators(model: Model, **changes: Any) -> Model:
-        return replace(model, actuators=replace(model.actuators, **changes))
-
-    channels = axes.shape[1]
-    makers: dict[str, ParameterMaker] = {
-        "actuator_scale": parameter_maker(
-            "actuator_scale",
-            lambda model: jnp.ones(channels) if model.actuators.scale is None else model.actuators.scale,
-            lambda model, new: with_actuators(model, scale=new),
-            channels, "-", "factor",
-        ),
-        "delay": parameter_maker(  # a delay below 0 has no meaning, and at 0 the derivative would vanish
-            "delay", lambda m: m.delay, lambda m, new: replace(m, delay=jnp.maximum(new[0], 1e-9)), 1, "s", "add"
-        ),
-        "disturbance_bias": parameter_maker(
-            "disturbance_bias",
-            lambda m: disturbances.bias(m.disturbance, plant.inputs),
-            lambda m, new: replace(m, disturbance=disturbances.with_bias(m.disturbance, new)),
-            plant.inputs, plant.input_unit, "add",
-        ),
-    }  # fmt: skip
+    add_vector("actuator_scale", "-", "factor", "actuators.scale", axes.shape[1])
+    # a delay below 0 has no meaning, and at 0 the derivative would vanish
+    add("delay", "s", "add", lambda m: m.delay, lambda m, new: replace(m, delay=jnp.maximum(new[0], 1e-9)), 1)
+    add(
+        "disturbance_bias", plant.input_unit, "add", lambda m: disturbances.bias(m.disturbance, plant.inputs),
+        lambda m, new: replace(m, disturbance=disturbances.with_bias(m.disturbance, new)), plant.inputs,
+    )  # fmt: skip
     if actuators.lag is not None:
-        makers["torque_lag"] = parameter_maker(
-            "torque_lag", lambda m: m.actuators.lag, lambda m, new: with_actuators(m, lag=new[0]), 1, "s", "log"
-        )
+        add(
+            "torque_lag", "s", "log", lambda m: m.actuators.lag,
+            lambda m, new: paths.put(m, "actuators.lag", new[0]), 1,
+        )  # fmt: skip
     for name, noise in model.noises.items():
-        key, count = ("state_noise", noise.size) if name == "x" else (f"{name}_noise", 1)
-        noise_unit = {"attitude": "rad", "rate": "rad/s", "x": ""}[name]
-
-        def set_noise(model: Model, new: Array, name: str = name, size: int = noise.size) -> Model:
-            return replace(model, noises={**model.noises, name: new * jnp.ones(size)})
-
-        makers[key] = parameter_maker(
-            key, lambda m, n=name, c=count: m.noises[n][:c], set_noise, count, noise_unit, "log"
-        )
-    for name, quantity_unit, kind in (
-        ("disturbance_amplitude", plant.input_unit, "factor"),
-        ("disturbance_phase", "rad", "add"),
-    ):
-        quantity: Any = name.removeprefix("disturbance_")
-        count = disturbances.values(model.disturbance, quantity).size
+        key, count, unit = ("state_noise", noise.size, "") if name == "x" else (f"{name}_noise", 1, NOISE_UNITS[name])
+        add(
+            key, unit, "log", lambda m, name=name, count=count: m.noises[name][:count],
+            lambda m, new, name=name, size=noise.size: replace(
+                m, noises={**m.noises, name: new * jnp.ones(size)}
+            ),
+            count,
+        )  # fmt: skip
+    quantities: Any = (("amplitude", plant.input_unit, "factor"), ("phase", "rad", "add"))
+    for quantity, unit, kind in quantities:
+        count = disturbances.count_values(model.disturbance, quantity)
         if count:
-            makers[name] = parameter_maker(
-                name,
-                lambda m, q=quantity: disturbances.values(m.disturbance, q),
+            add(
+                f"disturbance_{quantity}", unit, kind, lambda m, q=quantity: disturbances.values(m.disturbance, q),
                 lambda m, new, q=quantity: replace(m, disturbance=disturbances.with_values(m.disturbance, q, new)),
-                count, quantity_unit, kind,
+                count,
             )  # fmt: skip
     if model.is_spacecraft:
-        makers["inertia"] = lambda model: (model, _inertia_parameter(np.asarray(model.plant.inertia), prior))
-        makers["actuator_misalignment"] = lambda model: _misalignment_parameter(
+        possible["inertia"] = lambda: _inertia_parameter(np.asarray(plant.inertia), prior)
+        possible["actuator_misalignment"] = lambda: _misalignment_parameter(
             model, axes, *prior_sigma("actuator_misalignment", 1)
         )
         if "attitude" in model.noises:
-            makers["star_tracker_misalignment"] = parameter_maker(
-                "star_tracker_misalignment", lambda m: m.misalignment,
-                lambda m, new: replace(m, misalignment=new), 3, "rad", "add",
-            )  # fmt: skip
+            add_vector("star_tracker_misalignment", "rad", "add", "misalignment", 3)
         if "rate" in model.noises:
-            makers["gyro_scale"] = parameter_maker(
-                "gyro_scale", lambda m: m.rate_scale, lambda m, new: replace(m, rate_scale=new), 3, "-", "factor"
-            )
+            add_vector("gyro_scale", "-", "factor", "rate_scale", 3)
     if hasattr(plant, "coupling"):
-        modes = plant.frequency.size
-        makers["mode_frequency"] = parameter_maker(
-            "mode_frequency", lambda m: m.plant.frequency,
-            lambda m, new: replace(m, plant=replace(m.plant, frequency=new)), modes, "rad/s", "log",
-        )  # fmt: skip
-        makers["mode_damping"] = parameter_maker(  # within its uncertainty, the estimate of a small ratio may be < 0
-            "mode_damping", lambda m: m.plant.damping,
-            lambda m, new: replace(m, plant=replace(m.plant, damping=new)), modes, "-", "add",
-        )  # fmt: skip
-        makers["mode_coupling"] = lambda model: (model, _coupling_parameter(model, *prior_sigma("mode_coupling", 1)))
-    for path, leaf in _plant_leaves(plant):
-        makers.setdefault(path, lambda model, path=path, leaf=leaf: (model, _leaf_parameter(path, leaf)))
+        add_vector("mode_frequency", "rad/s", "log", "plant.frequency", plant.frequency.size)
+        # within its uncertainty, the estimate of a small damping ratio may be negative
+        add_vector("mode_damping", "-", "add", "plant.damping", plant.frequency.size)
+        possible["mode_coupling"] = lambda: _coupling_parameter(model, *prior_sigma("mode_coupling", 1))
+    if not model.is_spacecraft:  # the numbers inside a custom plant
+        for k, (key_path, leaf) in enumerate(tree_flatten_with_path(plant)[0]):
+            path = "plant" + keystr(key_path)
+            if not path.startswith(("plant.inertia", "plant.z0")):
+                possible.setdefault(path, lambda path=path, k=k, leaf=leaf: _leaf_parameter(path, model, k, leaf))
     if isinstance(getattr(scenario, "sensors", None), SensorSuite):
-        makers = {name: maker for name, maker in makers.items() if name not in HARDWARE_PARAMETERS}
-    return makers
+        possible = {name: make for name, make in possible.items() if name not in HARDWARE_PARAMETERS}
+    return possible
 
 
-def _plant_leaves(plant: Any) -> list[tuple[str, np.ndarray]]:
-    """Return the numbers inside a custom plant, by the path that names them in `identify.free`."""
-    if hasattr(plant, "with_inertia"):
-        return []
-    leaves, _ = tree_flatten_with_path(plant)
-    paths = [("plant" + keystr(path), np.asarray(leaf)) for path, leaf in leaves]
-    return [(path, leaf) for path, leaf in paths if not path.startswith(("plant.inertia", "plant.z0"))]
+def _number_parameter(
+    name: str,
+    unit: str,
+    kind: str,
+    model: Model,
+    get: Callable[[Model], Any],
+    put: Callable[[Model, Array], Model],
+    sigmas: np.ndarray,
+    has_prior: bool,
+) -> Parameter:
+    """Return the parameter of some numbers of a model.
 
-
-def _leaf_parameter(path: str, start: np.ndarray) -> Parameter:
-    sizes = np.where(start == 0.0, np.max(np.abs(start), initial=0.0) or 1.0, np.abs(start))
-    sigmas = USUAL_SIGMA["plant"] * sizes.ravel()
-
-    def find_leaf(model: Model) -> tuple[list[Any], Any, int]:
-        leaves, tree = jax.tree.flatten(model.plant)
-        names = ["plant" + keystr(leaf_path) for leaf_path, _ in tree_flatten_with_path(model.plant)[0]]
-        return leaves, tree, names.index(path)
-
-    def write(model: Model, c: Array) -> Model:
-        leaves, tree, index = find_leaf(model)
-        leaves[index] = jnp.asarray(start, float) + c.reshape(start.shape)
-        return replace(model, plant=jax.tree.unflatten(tree, leaves))
+    Args:
+        name: name of the parameter.
+        unit: unit of the numbers.
+        kind: effect of a coordinate c: "log" multiplies by e^c, "factor" multiplies by 1 + c, "add" adds c.
+        model: the model of the scenario.
+        get: returns the numbers of a model.
+        put: returns a model with other numbers.
+        sigmas: prior 1 sigma of the coordinates.
+        has_prior: whether [dispersion] gives it.
+    """
+    count = len(sigmas)
 
     def read(model: Model) -> Array:
-        leaves, _, index = find_leaf(model)
-        return jnp.ravel(leaves[index])
+        return jnp.asarray(get(model), float) * jnp.ones(count)
 
-    labels = [path] if start.size == 1 else [f"{path}_{k + 1}" for k in range(start.size)]
-    return Parameter(path, labels, "", np.diag(sigmas), False, write, read)
+    start = read(model)
+
+    def write(model: Model, c: Array) -> Model:
+        new = start * jnp.exp(c) if kind == "log" else start * (1.0 + c) if kind == "factor" else start + c
+        return put(model, new)
+
+    common = None if kind == "add" else 1.0 / sigmas
+    labels = [name] if count == 1 else [f"{name}_{k + 1}" for k in range(count)]
+    return Parameter(name, labels, unit, np.diag(sigmas), has_prior, write, read, common)
 
 
-def _misalignment_parameter(
-    model: Model, axes: np.ndarray, sigmas: np.ndarray, has_prior: bool
-) -> tuple[Model, Parameter]:
+def _leaf_parameter(path: str, model: Model, place: int, leaf: Any) -> Parameter:
+    """Return the parameter of a leaf of a custom plant, whose number among the leaves is `place`."""
+    start = np.asarray(leaf)
+    sizes = np.where(start == 0.0, np.max(np.abs(start), initial=0.0) or 1.0, np.abs(start))
+
+    def put(model: Model, new: Array) -> Model:
+        leaves, tree = jax.tree.flatten(model.plant)
+        leaves[place] = new.reshape(start.shape)
+        return replace(model, plant=jax.tree.unflatten(tree, leaves))
+
+    def get(model: Model) -> Array:
+        return jnp.ravel(jax.tree.leaves(model.plant)[place])
+
+    return _number_parameter(path, "", "add", model, get, put, USUAL_SIGMA["plant"] * sizes.ravel(), False)
+
+
+def _misalignment_parameter(model: Model, axes: np.ndarray, sigmas: np.ndarray, has_prior: bool) -> Parameter:
     """Return the parameter of the channels' misalignment: small rotations of each channel about two axes normal to it.
 
     A rotation of a channel about its own axis has no effect.
@@ -450,22 +419,21 @@ def _misalignment_parameter(
     count = 2 * directions.shape[1]
     labels = [f"actuator_misalignment_{k // 2 + 1}{'ab'[k % 2]}" for k in range(count)]
     factor = float(sigmas[0]) * np.eye(count)
-    return model, Parameter("actuator_misalignment", labels, "rad", factor, has_prior, write, read)
+    return Parameter("actuator_misalignment", labels, "rad", factor, has_prior, write, read)
 
 
 def _coupling_parameter(model: Model, sigmas: np.ndarray, has_prior: bool) -> Parameter:
-    start = np.asarray(model.plant.coupling)
-    row_norms = np.linalg.norm(start, axis=1, keepdims=True) * np.ones(3)
+    row_norms = np.linalg.norm(np.asarray(model.plant.coupling), axis=1, keepdims=True) * np.ones(3)
 
-    def write(model: Model, c: Array) -> Model:
-        plant = replace(model.plant, coupling=jnp.asarray(start) + c.reshape(start.shape)).with_rest_inverse()
-        return replace(model, plant=plant)
+    def put(model: Model, new: Array) -> Model:
+        return replace(model, plant=replace(model.plant, coupling=new.reshape(-1, 3)).with_rest_inverse())
 
-    labels = [f"mode_coupling_{k + 1}{i + 1}" for k in range(len(start)) for i in range(3)]
-    factor = np.diag(float(sigmas[0]) * row_norms.ravel())
-    return Parameter(
-        "mode_coupling", labels, "sqrt(kg) m", factor, has_prior, write, lambda model: jnp.ravel(model.plant.coupling)
-    )
+    labels = [f"mode_coupling_{k + 1}{i + 1}" for k in range(len(row_norms)) for i in range(3)]
+    parameter = _number_parameter(
+        "mode_coupling", "sqrt(kg) m", "add", model, lambda model: jnp.ravel(model.plant.coupling), put,
+        float(sigmas[0]) * row_norms.ravel(), has_prior,
+    )  # fmt: skip
+    return parameter._replace(labels=labels)
 
 
 def _inertia_parameter(start: np.ndarray, prior: Any) -> Parameter:

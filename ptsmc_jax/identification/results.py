@@ -135,10 +135,7 @@ def summary(identification: Identification) -> dict[str, Any]:
         "converged": identification.converged,
         "steps": identification.steps,
         "log_likelihood": identification.log_likelihood,
-        "parameters": [
-            {name: None if isinstance(v, float) and not np.isfinite(v) else v for name, v in row.items()}
-            for row in identification.table().iter_rows(named=True)
-        ],
+        "parameters": list(identification.table().iter_rows(named=True)),
         "undetermined": identification.undetermined,
         "gyro_bias": [
             {"log": fit.log.name, "estimate": bias.tolist(), "std": std.tolist()}

@@ -104,7 +104,7 @@ def test_the_verdict_on_short_logs_is_calibrated(samples):
     t, there = np.arange(samples + 1.0), np.ones((samples + 1, 6), bool)
     log = telemetry.Measurements("a log", t, {}, np.zeros((samples + 1, 3)))
     rows = filtering.Rows(t, np.ones(samples + 1), {}, there, log.command, np.zeros(3), np.arange(samples + 1))
-    none = filtering.Track(None, None, None, None)
+    none = filtering.FilterState(None, None, None, None, None)
     for _ in range(200):
         value = rng.standard_normal((samples, 6))
         fits = [
