@@ -1,1 +1,1 @@
-"""Simulations that test the paper: its cases and claims (`claims`), its errors (`slips`), and Remark 2 (`remark_2`)."""
+"""Simulations that test the paper: its cases, claims and Remark 2 (`claims`), and its errors (`slips`)."""

@@ -13,7 +13,8 @@ from matplotlib.figure import Figure
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.runs import Run
 from ptsmc_jax.figures import run_plots, style
-from ptsmc_jax.paper import claims, remark_2, slips
+from ptsmc_jax.paper import claims, slips
+from ptsmc_jax.paper.claims import Measured
 from ptsmc_jax.scenario import from_tables, parsing
 
 
@@ -24,7 +25,7 @@ class Reproduction:
     cases: dict[str, Run]
     claims: list[claims.Claim]
     slips: list[slips.Slip]
-    observers: list[remark_2.Measured]
+    observers: list[Measured]
 
     @property
     def ok(self) -> bool:
@@ -35,7 +36,7 @@ class Reproduction:
 def reproduce() -> Reproduction:
     """Simulate every case of the paper and check its claims."""
     cases = claims.simulate_cases()
-    return Reproduction(cases, claims.claims(cases), slips.slips(cases), remark_2.measure())
+    return Reproduction(cases, claims.claims(cases), slips.slips(cases), claims.measure_observers())
 
 
 def summary(reproduction: Reproduction) -> dict[str, Any]:
@@ -95,7 +96,7 @@ def figures_of(reproduction: Reproduction) -> dict[str, Figure]:
 
 
 @style.styled
-def _plot_observers(measured: list[remark_2.Measured]) -> Figure:
+def _plot_observers(measured: list[Measured]) -> Figure:
     """Plot each observer's estimation error, and the chattering under both signs (Remark 2)."""
     runs = {(run.observer, run.sign): run for run in measured}
     kinds = list(dict.fromkeys(run.observer for run in measured))
@@ -122,13 +123,13 @@ def _plot_observers(measured: list[remark_2.Measured]) -> Figure:
 
 
 def _markdown(reproduction: Reproduction) -> str:
-    claims = [(c.where, c.claim, c.measured, f"**{c.verdict}**", c.why) for c in reproduction.claims]
+    claim_rows = [(c.where, c.claim, c.measured, f"**{c.verdict}**", c.why) for c in reproduction.claims]
     shown = [(s.where, s.paper, s.correct, s.shown) for s in reproduction.slips]
     return "\n".join(
         [
             "# Claims of the paper and measurements",
             "",
-            *_markdown_table(("where", "the paper", "measured", "verdict", "why"), claims),
+            *_markdown_table(("where", "the paper", "measured", "verdict", "why"), claim_rows),
             "",
             "# Errors in the equations of the paper, and their evidence",
             "",
@@ -136,7 +137,7 @@ def _markdown(reproduction: Reproduction) -> str:
             "",
             "# Remark 2: observers and signs, sampled at 20 Hz, t_f = 35 s, delta = 0.5 s, no noise",
             "",
-            *_markdown_table(*remark_2.format_table(reproduction.observers)),
+            *_markdown_table(*claims.format_observers(reproduction.observers)),
             "",
         ]
     )
