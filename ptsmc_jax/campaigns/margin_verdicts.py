@@ -67,7 +67,7 @@ def prepare(ready: Study, rows: np.ndarray | Row | None = None) -> None:
         with_delay = any(requirement.metric == DELAY for requirement in ready.margins)
         _loops_and_margins.prepare(*_arguments(ready.parts, ready.dispersion, 0, trials, with_delay))
     elif ready.margins:
-        run_margins.judged_margins_jit.prepare(ready.parts)
+        run_margins.judged_margins.prepare(ready.parts)
 
 
 def _select_trials(ready: Study, rows: np.ndarray | Row | None) -> np.ndarray | Row | None:

@@ -127,14 +127,11 @@ class LocalCoordinates:
         return jnp.concatenate([plant.local_coordinates(base.x, other.x), seen, sensor_part, wheel_part, other_part])
 
 
-def _float_leaves(memory: Any) -> list[Array]:
-    """Return the floating-point leaves of the memory of sensors or of a law."""
-    return [v for v in jax.tree.leaves(memory) if jnp.issubdtype(jnp.result_type(v), jnp.floating)]
+def _float_leaves(memory: Any) -> Any:
+    """Return the memory of sensors or of a law, with None instead of leaves that are not floating-point numbers."""
+    return jax.tree.map(lambda v: v if jnp.issubdtype(jnp.result_type(v), jnp.floating) else None, memory)
 
 
-def _replace_float_leaves(memory: Any, numbers: list[Array]) -> Any:
-    """Return the memory with its floating-point leaves replaced by `numbers`."""
-    leaves, structure = jax.tree.flatten(memory)
-    new = iter(numbers)
-    leaves = [next(new) if jnp.issubdtype(jnp.result_type(v), jnp.floating) else v for v in leaves]
-    return jax.tree.unflatten(structure, leaves)
+def _replace_float_leaves(memory: Any, floats: Any) -> Any:
+    """Return the memory with other floating-point leaves, see `_float_leaves`."""
+    return jax.tree.map(lambda new, old: old if new is None else new, floats, memory, is_leaf=lambda v: v is None)

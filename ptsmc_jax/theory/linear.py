@@ -17,7 +17,7 @@ over its interval; see also `Sensors.at_control_samples`. Read `simulate_nominal
 `open_at_input` first.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -32,6 +32,7 @@ from ptsmc_jax.devices.actuators import ActuatorState
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.numerics import stacking
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
+from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation import clock
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.computer import Computer, Decision, Period, decide
@@ -76,18 +77,13 @@ class NominalRun(NamedTuple):
 
 def quiet(parts: Parts) -> Parts:
     """Return the parts without noise, disturbance and timing jitter."""
-    no_disturbance = jax.tree_util.Partial(_zero_disturbance, jnp.zeros(parts.plant.inputs))
     return replace(
         parts,
         sensors=parts.sensors.at_control_samples().without_noise(),
-        disturbance=no_disturbance,
+        disturbance=disturbances.Constant(jnp.zeros(parts.plant.inputs)),
         walk_rate=None,
         jitter=None,
     )
-
-
-def _zero_disturbance(zero: Array, t: Scalar, x: Any) -> Array:
-    return zero
 
 
 def simulate_nominal(parts: Parts) -> NominalRun:
@@ -262,14 +258,25 @@ def linearise_periods(
     parts = replace(parts, clock=clock.flight_clock(1.0, 1.0))
     selected = jax.tree.map(lambda v: np.asarray(v)[indices], run), widths
 
-    def linearise_batch(k: int) -> LinearisedPeriod:
-        batch = np.resize(np.arange(k, min(k + PERIODS_PER_CALL, len(indices))), PERIODS_PER_CALL)
-        runs_and_widths = jax.tree.map(lambda v: v[batch], selected)
-        result = _linearise_batch(parts, *runs_and_widths, fractional_delays=fractional_delays)
-        return jax.tree.map(np.asarray, result)
+    def linearise_batch(batch: tuple[NominalRun, Any]) -> LinearisedPeriod:
+        return _linearise_batch(parts, *batch, fractional_delays=fractional_delays)
 
-    batches = [linearise_batch(k) for k in range(0, len(indices), PERIODS_PER_CALL)]
-    return jax.tree.map(lambda *blocks: np.concatenate(blocks)[: len(indices)], *batches)
+    return map_in_batches(linearise_batch, selected, PERIODS_PER_CALL)
+
+
+def map_in_batches(function: Callable[[Any], Any], items: Any, size: int) -> Any:
+    """Apply a compiled function to batches of items and return NumPy arrays, with the items along the first axis.
+
+    All batches have `size` items, so that JAX does not compile a program for each number of items.
+    """
+    count = np.shape(jax.tree.leaves(items)[0])[0]
+
+    def apply(first: int) -> Any:
+        batch = np.resize(np.arange(first, min(first + size, count)), size)
+        return jax.tree.map(np.asarray, function(jax.tree.map(lambda v: np.asarray(v)[batch], items)))
+
+    batches = [apply(first) for first in range(0, count, size)]
+    return jax.tree.map(lambda *blocks: np.concatenate(blocks)[:count], *batches)
 
 
 @programs.jit(static_argnames=("fractional_delays",), compiler_options=programs.FAST_COMPILE)
@@ -285,7 +292,7 @@ def _linearise_batch(
     return lapack.vmap(linearise)(nominal_periods, widths)
 
 
-def open_loops(parts: Parts, run: NominalRun, indices: np.ndarray) -> Loop:
+def open_loops(parts: Parts, run: NominalRun, indices: np.ndarray | Array, *, fractional_delays: bool = True) -> Loop:
     """Return the opened loops of several control periods, stacked along the first axis; the period h is in [s].
 
     If a star tracker is slower than the loop, each loop is the mean over the star tracker's interval.
@@ -293,41 +300,26 @@ def open_loops(parts: Parts, run: NominalRun, indices: np.ndarray) -> Loop:
     Args:
         parts: the scenario.
         run: the nominal run.
-        indices: numbers of the periods (periods,).
-    """
-    periods = _periods_to_average(parts, indices)
-    return _average_loops(linearise_periods(parts, run, periods.reshape(-1)).loop, periods.shape)
-
-
-def open_loops_traced(parts: Parts, run: NominalRun, indices: Array, *, fractional_delays: bool = True) -> Loop:
-    """Return the loops of `open_loops`, period h in [s], inside a JAX transformation: the indices may be tracers.
-
-    Args:
-        parts: the scenario.
-        run: the nominal run.
-        indices: numbers of the periods (periods,).
+        indices: numbers of the periods (periods,). For a NumPy array, a compiled program linearises the periods in
+            batches. A JAX array may be traced.
         fractional_delays: whether to compute N and O at all `NODES`, see `linearise_period`.
     """
-    periods = _periods_to_average(parts, indices)
+    periods = (indices[:, None] - np.arange(averaging_periods(parts))[None]).clip(0)
+    if isinstance(periods, np.ndarray):
+        loops = linearise_periods(parts, run, periods.reshape(-1), fractional_delays=fractional_delays).loop
+    else:
 
-    def open_one(index: Array) -> Loop:
-        return linearise_period(parts, jax.tree.map(lambda v: v[index], run), fractional_delays=fractional_delays).loop
+        def open_one(index: Array) -> Loop:
+            nominal_period = jax.tree.map(lambda v: v[index], run)
+            return linearise_period(parts, nominal_period, fractional_delays=fractional_delays).loop
 
-    return _average_loops(lapack.vmap(open_one)(periods.reshape(-1)), periods.shape)
+        loops = lapack.vmap(open_one)(periods.reshape(-1))
+    return jax.tree.map(lambda v: v.reshape(*periods.shape, *v.shape[1:]).mean(axis=1), loops)
 
 
 def averaging_periods(parts: Parts) -> int:
     """Return the number of control periods between star tracker samples, over which a loop is averaged."""
     return getattr(parts.sensors, "every", 1)
-
-
-def _periods_to_average(parts: Parts, indices: Any) -> Any:
-    """Return the numbers of the periods whose loops are averaged for each index, (indices, every)."""
-    return (indices[:, None] - np.arange(averaging_periods(parts))[None]).clip(0)
-
-
-def _average_loops(loops: Loop, shape: tuple[int, ...]) -> Loop:
-    return jax.tree.map(lambda v: v.reshape(*shape, *v.shape[1:]).mean(axis=1), loops)
 
 
 def is_full(ticks: Ticks, period: Any) -> Any:

@@ -83,23 +83,6 @@ def compute_each(loops: Loop, sensors: bool = False, with_delay: bool = True) ->
     return jax.lax.map(partial(compute, sensors=sensors, with_delay=with_delay), loops)
 
 
-def compute_in_batches(loops: Loop) -> Margins:
-    """Return the margins of several loops as NumPy arrays; the first axis is the loop.
-
-    The function calls the same compiled program for `LOOPS_PER_CALL` loops at a time. Therefore JAX does not compile
-    a program for each number of loops.
-    """
-    count = np.shape(loops.period)[0]
-
-    def compute_batch(first: int) -> Margins:
-        """Return the margins of `LOOPS_PER_CALL` loops, from the index `first` on."""
-        batch = np.resize(np.arange(first, min(first + LOOPS_PER_CALL, count)), LOOPS_PER_CALL)
-        return jax.tree.map(np.asarray, compute_each(jax.tree.map(lambda v: np.asarray(v)[batch], loops)))
-
-    batches = [compute_batch(first) for first in range(0, count, LOOPS_PER_CALL)]
-    return jax.tree.map(lambda *blocks: np.concatenate(blocks)[:count], *batches)
-
-
 class _Spectrum(NamedTuple):
     """L of an opened loop from 0 to the Nyquist frequency."""
 

@@ -18,7 +18,7 @@ from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.theory import limit_cycles, linear, margins
 from ptsmc_jax.theory.limit_cycles import History, command_history
 from ptsmc_jax.theory.linear import Loop
-from ptsmc_jax.theory.margins import FIELDS, Margins
+from ptsmc_jax.theory.margins import Margins
 
 # shortest time to go at which margins are computed, in periods; gains then change by a tenth in a period
 SHORTEST = 10
@@ -107,41 +107,37 @@ class TimedMargins(NamedTuple):
     margins: Margins  # (times, m)
 
 
-def margins_at(
-    parts: Parts, times_to_go: Float[Array, " times"], simulated: linear.NominalRun | None = None
-) -> TimedMargins:
+def margins_at(parts: Parts, times_to_go: Float[Array, " times"], run: linear.NominalRun) -> TimedMargins:
     """Return the margins at some times to go and in the hold phase.
 
     Args:
         parts: the sampled scenario.
         times_to_go: times to go (times,) [s].
-        simulated: its nominal run, or None to simulate it.
+        run: its nominal run.
     """
-    run: linear.NominalRun = linear.simulate_nominal_jit(parts) if simulated is None else simulated
     indices = np.asarray(_find_period_indices_jit(parts, run, times_to_go))
     loops = linear.open_loops(parts, run, indices)
     ticks = jax.tree.map(lambda v: np.asarray(v)[indices], run.period.now)
-    return TimedMargins(ticks.t, ticks.hold, loops, margins.compute_in_batches(loops))
+    values = linear.map_in_batches(margins.compute_each, loops, margins.LOOPS_PER_CALL)
+    return TimedMargins(ticks.t, ticks.hold, loops, values)
 
 
-def judged_loops(
-    parts: Parts, simulated: linear.NominalRun | None = None, *, fractional_delays: bool = True
-) -> tuple[Loop, Array]:
+def judged_loops(parts: Parts, run: linear.NominalRun, *, fractional_delays: bool = True) -> tuple[Loop, Array]:
     """Return the loops at the `judged_times` and in the hold phase, and which of them are in the hold phase.
 
     The first axis (times + 1) of the loops is the time; the last one is in the hold phase. The unit of h is [s].
 
     Args:
         parts: the sampled scenario.
-        simulated: its nominal run, or None to simulate it.
+        run: its nominal run.
         fractional_delays: whether the loops support fractional delays, see `linear.linearise_period`.
     """
-    run = linear.simulate_nominal(parts) if simulated is None else simulated
     indices = find_period_indices(parts, run, judged_times(parts))
-    loops = linear.open_loops_traced(parts, run, indices, fractional_delays=fractional_delays)
+    loops = linear.open_loops(parts, run, indices, fractional_delays=fractional_delays)
     return loops, run.period.now.hold[indices]
 
 
+@programs.jit(compiler_options=programs.FAST_COMPILE, title="the margins of the nominal run")
 def judged_margins(parts: Parts) -> tuple[Margins, Array, History]:
     """Return the margins at the `judged_times` and in the hold phase, and the commands of the nominal run.
 
@@ -153,20 +149,15 @@ def judged_margins(parts: Parts) -> tuple[Margins, Array, History]:
     return margins.compute_each(loops), hold, command_history(parts, run)
 
 
-judged_margins_jit = programs.jit(
-    judged_margins, compiler_options=programs.FAST_COMPILE, title="the margins of the nominal run"
-)
-
-
 def judge_run(parts: Parts) -> tuple[Margins, np.ndarray, limit_cycles.LimitCycle | None]:
     """Return the margins at the `judged_times` and in the hold phase, and the limit cycle of the nominal run.
 
     The margins are (times + 1, m). The second result marks the entries in the hold phase, (times + 1,) bool. If
     there is a limit cycle, the margins in the hold phase are zero, see `limit_cycles`.
     """
-    values, hold, commands = jax.tree.map(np.asarray, judged_margins_jit(parts))
+    values, hold, commands = jax.tree.map(np.asarray, judged_margins(parts))
     limit_cycle = limit_cycles.find(parts, commands)
-    return (values if limit_cycle is None else limit_cycles.zero_margins(values, hold)), hold, limit_cycle
+    return limit_cycles.zero_margins(values, hold & (limit_cycle is not None)), hold, limit_cycle
 
 
 def margins_along_run(parts: Parts, times: int = 24) -> Course:
@@ -181,19 +172,16 @@ def margins_along_run(parts: Parts, times: int = 24) -> Course:
     index_at = {t: k for k, t in reversed(list(enumerate(at_times.t.tolist()))) if not at_times.hold[k]}
     order = np.asarray([k for _, k in sorted(index_at.items())] + [len(at_times.t) - 1])
     t, _, loops, at_input = jax.tree.map(lambda v: v[order], at_times)
-    judged = (order < TIMES) | (order == order[-1])
-    last = jax.tree.map(lambda v: v[-1:], loops)
-    at_sensors = margins.compute_each(last, sensors=True)
+    in_hold, last = order == order[-1], jax.tree.map(lambda v: v[-1:], loops)
+    judged = (order < TIMES) | in_hold
     limit_cycle = limit_cycles.find(parts, commands)
-    if limit_cycle is None:
-        together = margins.simultaneous_margins(jax.tree.map(lambda v: v[0], last))
-    else:
-        together = dict.fromkeys(FIELDS, float("nan"))
-        at_input, at_sensors = (
-            limit_cycles.zero_margins(at_input, order == order[-1]),
-            limit_cycles.zero_margins(at_sensors, [True]),
-        )
-    at_sensors = jax.tree.map(lambda v: np.asarray(v)[0], at_sensors)
+    has_cycle = limit_cycle is not None
+    at_input = limit_cycles.zero_margins(at_input, in_hold & has_cycle)
+    at_sensors = limit_cycles.zero_margins(margins.compute_each(last, sensors=True), [has_cycle])
+    at_sensors = jax.tree.map(lambda v: v[0], at_sensors)
+    together = margins.simultaneous_margins(jax.tree.map(lambda v: v[0], last))
+    if has_cycle:
+        together = dict.fromkeys(together, float("nan"))
     return Course(
         t,
         judged,

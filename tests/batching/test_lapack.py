@@ -141,9 +141,7 @@ def test_analyses_of_a_system_never_batch_eigh(batched_calls):
     of_periods = jax.tree.map(lambda v: jnp.ones(v.shape, v.dtype), run)
     traces = {
         "loops": linear._linearise_batch.trace(parts, some, None, fractional_delays=True),
-        "loops of traced parts": jax.make_jaxpr(lambda k: linear.open_loops_traced(parts, of_periods, k))(
-            jnp.arange(4)
-        ),
+        "loops of traced parts": jax.make_jaxpr(lambda k: linear.open_loops(parts, of_periods, k))(jnp.arange(4)),
         "loops of trials": margin_verdicts._loops_and_margins.trace(parts, dispersion, jnp.uint32(0), trials, 1, True),
         "steps": timing._system_rates.trace(parts, (jnp.linspace(0.0, 1.0, 4), jnp.ones((4, 4)))),
     }

@@ -196,7 +196,7 @@ def test_margins_of_a_pd_law_agree_with_the_closed_form():
 def test_gain_factor_below_one_gives_the_distance_to_the_nearest_stability_limit():
     """The input gain of the plant is 0.001 times the design model, so that the loop needs a larger gain."""
     parts = scenario.study(scenario.from_tables(tomllib.loads(CHAIN))).parts
-    loops = run_margins.margins_at(parts, jnp.asarray([1.0])).loops
+    loops = run_margins.margins_at(parts, jnp.asarray([1.0]), linear.simulate_nominal_jit(parts)).loops
     weak = replace(loops, new=1e-3 * loops.new, old=1e-3 * loops.old)
     factor = float(10.0 ** (margins.compute_each(weak).gain_up[-1, 0] / 20.0))
     weak = jax.tree.map(lambda v: v[-1], weak)

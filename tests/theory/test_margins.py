@@ -584,7 +584,8 @@ def test_hold_loop_does_not_depend_on_delta(delta):
     parts = scenario.study(scenario.from_tables(tables)).parts
 
     def in_hold(delta):
-        loops, _ = run_margins.judged_loops(with_gains(parts, {"delta": delta}), fractional_delays=False)
+        changed = with_gains(parts, {"delta": delta})
+        loops, _ = run_margins.judged_loops(changed, linear.simulate_nominal(changed), fractional_delays=False)
         return jax.tree.map(lambda v: v[-1], loops)
 
     loop, slopes = jax.jit(lambda by: jax.jvp(in_hold, (by,), (1.0,)))(delta)
