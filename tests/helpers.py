@@ -30,7 +30,7 @@ from ptsmc_jax.plants import integrator_chain, rigid_body
 from ptsmc_jax.signals import disturbances, references
 from ptsmc_jax.simulation import clock, rollout
 from ptsmc_jax.simulation.rollout import Parts
-from ptsmc_jax.theory import rates, solutions
+from ptsmc_jax.theory import envelopes, solutions
 from tests.tree import QUICKLY as QUICKLY
 from tests.tree import ROOT as ROOT
 
@@ -248,7 +248,7 @@ def chain_parts(
         largest = vector(1.5 * t_f / steps[0])
         timing = clock.Graded(vector(t_end), vector(1.0), largest, jnp.zeros(0), *steps)
     else:
-        pace = max(rates.hold_rates(law).values())
+        pace = max(envelopes.hold_rates(law).values())
         timing = roomy(clock.graded_clock(t_f, delta, t_end, 1.0, pace, 0.0, (0.0, 0.0), (), n))
     return Parts(
         plant=model,

@@ -25,8 +25,7 @@ from ptsmc_jax.scenario.tables import Scenario, check_scenario
 from ptsmc_jax.scenario.values import MOST_STEPS
 from ptsmc_jax.simulation import clock
 from ptsmc_jax.simulation.assembly import Parts, Setup
-from ptsmc_jax.theory import rates, solutions
-from ptsmc_jax.theory.exact_motion import plant_motion
+from ptsmc_jax.theory import envelopes, solutions
 
 MOST_SUBSTEPS = 200  # largest number of integration steps in a control period
 # keys of smooth motions: steps of 0.1 rad are accurate enough, see `_count_substeps`
@@ -193,7 +192,7 @@ def _too_fast_error(scenario: Scenario, key: str, reason: str) -> ScenarioError:
 @programs.jit  # compiled as one program instead of one for each operation
 def _layer_rates(controller: Any, observer: Any, visited: Any) -> tuple:
     """Return the fastest rates in the boundary layer before and after the hand-over [1/s]."""
-    return rates.boundary_layer(controller, observer.error_bound().largest, visited)
+    return envelopes.boundary_layer(controller, observer.error_bound().largest, visited)
 
 
 def _with_prescribed_time_law(setup: Setup) -> Setup:
@@ -216,7 +215,7 @@ def _system_rates(setup: Setup, visited: tuple) -> tuple:
         return plant.jacobian(t, plant.with_hidden_at_rest(x), u)
 
     def zero_error_acceleration(t: Any) -> Any:
-        return plant_motion(kinematics, t, setup.initial, (zero, zero, zero)).w_dot
+        return solutions.plant_motion(kinematics, t, setup.initial, (zero, zero, zero)).w_dot
 
     times = setup.t_end * jnp.linspace(0.0, 1.0, 509)  # 509 is prime, so that the samples rarely alias with a period
     steady = lapack.vmap(lambda t: jax.jvp(zero_error_acceleration, (t,), (jnp.ones_like(t),)))(times)
@@ -259,7 +258,11 @@ def _continuous_grid(
     names = ("t_f", "k1", "sign_width", "surface_rate")
     fastest_law = dataclasses.replace(setup.controller, **{name: vector(getattr(reach, name)) for name in names})
     layer_rates = _fastest_layer_rates(reach, fastest_law, setup.observer, visited)
-    decay_rates, frequency, order = rates.hold_rates(fastest_law), _fastest_frequency(frequencies), scenario.grid_order
+    decay_rates, frequency, order = (
+        envelopes.hold_rates(fastest_law),
+        _fastest_frequency(frequencies),
+        scenario.grid_order,
+    )
 
     def steps_for(frequency: float = 0.0, layer: tuple[float, float] = (0.0, 0.0), rate: float = 0.0) -> float:
         total = sum(clock.graded_steps(reach.t_f, reach.smallest_delta, t_end, rate, frequency, layer, order)[:2])

@@ -4,8 +4,6 @@ Read `exact_hold` first. "Exact" means a perfect disturbance estimate and K2 = 0
 loop without noise.
 """
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +16,7 @@ from ptsmc_jax.numerics import guards, integrators
 from ptsmc_jax.numerics.pytrees import Scalar
 from ptsmc_jax.simulation.rollout import Parts
 from ptsmc_jax.theory import envelopes, solutions
-from ptsmc_jax.theory.closed_forms import ChainMotion
+from ptsmc_jax.theory.solutions import ChainMotion
 
 Vector = Float[Array, " n"]
 
@@ -87,29 +85,24 @@ def error_bound(parts: Parts, t: ArrayLike) -> np.ndarray:
     lags to its initial state and to s. The poles of the lags are the roots p_i of the surface (39). Lags with the poles
     Re p_i, driven by the bound |s(t_s)| e^(-k t) + (beta/k)^(1/2) of `sliding_bound`, bound the response to s.
     """
-    hand_over = _hand_over_bounds(parts)
     lags = np.poly(np.real(surface_roots(parts.controller.surface())))[1:][::-1]
-    return np.asarray(_error_bound(parts, hand_over, jnp.asarray(lags), jnp.asarray(t)))
+    return np.asarray(_error_bound(parts, *_hand_over_bounds(parts), jnp.asarray(lags), jnp.asarray(t)))
 
 
-class _HandOver(NamedTuple):
-    """Bounds at the hand-over, for each component of the error."""
+def _hand_over_bounds(parts: Parts) -> tuple[Array, Array, Array, Array]:
+    """Return bounds at the hand-over, and the limit of the bound on |s_i| for t -> infinity, (beta/k)^(1/2).
 
-    centre: Array  # (m, n) The error and its derivatives are between centre - half and centre + half.
-    half: Array  # (m, n) Half width of this interval.
-    s: Array  # (m,) Bound on |s|.
-    limit: Array  # Limit of the bound on |s_i| for t -> infinity, (beta/k)^(1/2).
-
-
-def _hand_over_bounds(parts: Parts) -> _HandOver:
+    The error and its derivatives are between centre - half and centre + half, (m, n) each. The third result is a bound
+    on |s|, (m,).
+    """
     law = parts.controller
-    beta = envelopes.switching_rate(parts) * envelopes.TANH_LOSS * float(law.sign_width)
-    limit = np.sqrt(beta / float(law.reaching_rate))
-    return _bounds_at_hand_over(parts, *(jnp.asarray(v) for v in (*envelopes.sliding_envelope(parts), limit)))
+    beta = float(envelopes.switching_rates(parts)[0]) * envelopes.TANH_LOSS * float(law.sign_width)
+    limit = jnp.asarray(np.sqrt(beta / float(law.reaching_rate)))
+    return *_bounds_at_hand_over(parts, *map(jnp.asarray, envelopes.sliding_envelope(parts))), limit
 
 
 @programs.jit
-def _bounds_at_hand_over(parts: Parts, s0: Scalar, residual_before: Scalar, limit: Scalar) -> _HandOver:
+def _bounds_at_hand_over(parts: Parts, s0: Scalar, residual_before: Scalar) -> tuple[Array, Array, Array]:
     law = parts.controller
 
     def component_interval(x0: Vector) -> tuple[Vector, Vector]:
@@ -117,11 +110,13 @@ def _bounds_at_hand_over(parts: Parts, s0: Scalar, residual_before: Scalar, limi
 
     centre, half = jax.vmap(component_interval)(solutions.initial_errors(parts))
     weights = jnp.append(law.surface(), 1.0)
-    return _HandOver(centre, half, jnp.abs(centre @ weights) + half @ jnp.abs(weights), limit)
+    return centre, half, jnp.abs(centre @ weights) + half @ jnp.abs(weights)
 
 
 @programs.jit
-def _error_bound(parts: Parts, hand_over: _HandOver, lags: Vector, t: Array) -> Array:
+def _error_bound(
+    parts: Parts, centre: Array, half: Array, s_bound: Array, s_limit: Array, lags: Vector, t: Array
+) -> Array:
     law, n = parts.controller, parts.controller.order
     surface, rate = law.surface(), law.reaching_rate
     on_surface = jnp.eye(n, n - 1).at[-1].set(-surface)  # basis (columns) of the states with s = 0
@@ -133,8 +128,7 @@ def _error_bound(parts: Parts, hand_over: _HandOver, lags: Vector, t: Array) -> 
         decaying_response, constant_response = (
             exact_hold(elapsed, lags, k, off_surface).x[0] for k in (rate, jnp.zeros_like(rate))
         )
-        centre, half = hand_over.centre[:, :-1], hand_over.half[:, :-1]
-        free_bound = jnp.abs(centre @ surface_response) + half @ jnp.abs(surface_response)
-        return guards.norm(free_bound + hand_over.s * decaying_response + hand_over.limit * constant_response)
+        free_bound = jnp.abs(centre[:, :-1] @ surface_response) + half[:, :-1] @ jnp.abs(surface_response)
+        return guards.norm(free_bound + s_bound * decaying_response + s_limit * constant_response)
 
     return jax.vmap(error_bound_after)(t - law.hand_over)

@@ -42,11 +42,6 @@ def later_peak_ratio(eta: Scalar) -> Scalar:
     return (eta - 1.0) / (eta - 2.0) * jnp.exp(-(2.0 * eta - 3.0) / (eta - 1.0))
 
 
-def later_peak_time(eta: Scalar, t_f: Scalar) -> Scalar:
-    """Return the time of the braking torque peak of `later_peak_ratio` [s], for small angles."""
-    return t_f * (1.0 - jnp.exp(-(2.0 * eta - 3.0) / ((eta - 1.0) * (eta - 2.0))))
-
-
 def shortest_time(
     inertia: Float[Array, "3 3"],
     q: Float[Array, "4"],

@@ -1,42 +1,19 @@
 """Stability limits of the sampled double integrator under proportional and derivative feedback.
 
 Near the reference each component of the attitude error obeys eps'' = a with a = -kp eps - kd eps'. The command a is
-computed from a sample, may be delayed and is then held for a period. The gains kp and kd come from (57) and (60), see
-`gains`, which is the function to read first. The tuner derives its gain bounds, and maps their stability lines, from
-these limits; the linearised loop (`linear`) is not needed for them.
+computed from a sample, may be delayed and is then held for a period. The gains follow from (57) and (60), with the time
+to go tau and k = (K1 + g)/2, where g is the derivative of the switching term in the boundary layer:
+
+    before the hand-over: kp = eta^2/tau^2 + g eta/2,  kd = (2 eta - 1)/tau + g tau/2
+    after the hand-over:  kp = c k,                    kd = c + k
+
+The tuner derives its gain bounds, and maps their stability lines, from these limits; the linearised loop (`linear`) is
+not needed for them.
 """
 
 from collections.abc import Callable
 
 import numpy as np
-
-
-def gains(
-    t: np.ndarray, t_f: float, eta: float, delta: float, k1: float, switching_derivative: float, surface_rate: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the gains kp [1/s^2] and kd [1/s] of the frozen loop, (times,) each.
-
-    The time to go is tau = t_f - t, and k = (K1 + g)/2 with the derivative g of the switching term:
-
-        before the hand-over: kp = eta^2/tau^2 + g eta/2,  kd = (2 eta - 1)/tau + g tau/2
-        after the hand-over:  kp = c k,                    kd = c + k
-
-    Args:
-        t: times (times,) [s].
-        t_f: prescribed time [s].
-        eta: exponent of the law [-].
-        delta: time between the hand-over and t_f [s].
-        k1: K1 of (60) [1/s].
-        switching_derivative: g, derivative of the switching term in the boundary layer, |T J^-1| K2 / sign_width.
-        surface_rate: c [1/s].
-    """
-    tau = t_f - np.asarray(t, dtype=float)
-    hold = tau <= delta * (1 + 1e-9)
-    tau_before = np.where(hold, 1.0, tau)
-    after = (k1 + switching_derivative) / 2
-    kp = np.where(hold, surface_rate * after, eta**2 / tau_before**2 + switching_derivative * eta / 2)
-    kd = np.where(hold, surface_rate + after, (2 * eta - 1) / tau_before + switching_derivative * tau_before / 2)
-    return kp, kd
 
 
 def _transition_matrix(kp: float, kd: float, h: float, delay: float) -> np.ndarray:

