@@ -73,22 +73,30 @@ class RejectedSearch:
 
 
 @dataclass(frozen=True)
-class Tuning:
+class _Judged:
+    """The gains of a search, and their results on held-out trials."""
+
+    search: Search
+    search_end: float  # time of the monotonic clock at the end of the search [s]
+    earlier: list[RejectedSearch]
+    gains: dict[str, float]  # rounded gains by name
+    tuned: Scenario  # scenario with the rounded gains, on the flight clock
+    held_out_seed: int  # seed of the held-out trials
+    trials: Trials  # held-out trials of these gains
+    verdicts: list[Verdict]  # verdicts on these gains from the held-out trials
+
+
+@dataclass(frozen=True)
+class Tuning(_Judged):
     """The results of a tuning run, which may have been interrupted."""
 
-    tuned: Scenario  # scenario with the tuned gains, on the flight clock
-    gains: dict[str, float]
-    search: Search
-    earlier: list[RejectedSearch]
     at_bound: dict[str, str]
     training: Trials  # tuned gains on the training trials
     held_out: dict[str, Trials]  # held-out trials: "tuned" and the keys of `judging.reference_scenarios`
     published_unavailable: str | None  # reason why the published gains cannot be simulated
     seed: int  # seed of the training trials and the search
-    held_out_seed: int  # seed of the held-out trials
     judged_gains: dict[str, dict[str, float]]  # gains by name, for each key of `held_out`
     lower_bounds: dict[str, float | None]  # lower bound of the RMS window error, for each key of `held_out`
-    verdicts: list[Verdict]  # verdicts on the tuned gains from the held-out trials
     broken_by: dict[str, list[str]]  # gains that are more accurate than the tuned ones, and the metrics that they break
     shortest: ShortestTime | None  # shortest t_f that the torque limit allows; None: no torque limit, or t_f is tuned
     trust: Trust | None  # None: interrupted, or not requested
@@ -101,25 +109,12 @@ class Tuning:
     @property
     def met(self) -> bool:
         """Whether the held-out trials meet every requirement, and none of them failed."""
-        return judging.meets_requirements(self.verdicts, self.held_out["tuned"])
+        return judging.meets_requirements(self.verdicts, self.trials)
 
     @property
     def status(self) -> str:
         """Return "interrupted", "met" or "not met"."""
         return "interrupted" if self.search.interrupted else "met" if self.met else "not met"
-
-
-@dataclass(frozen=True)
-class _Judged:
-    """The gains of a search, and their results on held-out trials."""
-
-    search: Search
-    gains: dict[str, float]  # rounded gains by name
-    scenario: Scenario  # scenario with the rounded gains, on the flight clock
-    seed: int  # seed of the held-out trials
-    trials: Trials
-    verdicts: list[Verdict]
-    search_end: float  # time of the monotonic clock at the end of the search [s]
 
 
 def tune(
@@ -154,7 +149,7 @@ def tune(
     report("compiling", 0, 0, np.nan, 0.0)
     setup = posing.set_up_tuning(scenario, seed, journal)
     references, published_error = judging.reference_scenarios(scenario)
-    judged, earlier, setup = _search_and_judge(scenario, setup, journal, report, tries)
+    judged, setup = _search_and_judge(scenario, setup, journal, report, tries)
     evaluate = setup.evaluate
     outcome, rollouts, gradients = judged.search, evaluate.rollouts, evaluate.gradients
     check = None
@@ -164,11 +159,9 @@ def tune(
     training = simulations.simulate_trials(
         problem.batch_of(np.arange(problem.averaged)), np.asarray([*judged.gains.values()])
     )
-    candidates = {"tuned": judged.scenario} | {
-        name: judging.on_flight_clock(other) for name, other in references.items()
-    }
+    candidates = {"tuned": judged.tuned} | {name: judging.on_flight_clock(other) for name, other in references.items()}
     held_out = {"tuned": judged.trials} | {
-        name: judging.judge(other, judged.seed) for name, other in references.items()
+        name: judging.judge(other, judged.held_out_seed) for name, other in references.items()
     }
     shortest = _find_shortest_time(setup, judged)
     trust_checks, beyond_bounds, at_bound = None, {}, evaluate.bounds.at_bound(outcome.gains)
@@ -179,20 +172,15 @@ def tune(
         relevant = {name: side for name, side in at_bound.items() if not profiles[name].is_flat}
         beyond_bounds = _results_beyond_bounds(judged, relevant)
     return Tuning(
-        tuned=judged.scenario,
-        gains=judged.gains,
-        search=outcome,
-        earlier=earlier,
+        **vars(judged),
         at_bound=at_bound,
         training=training,
         held_out=held_out,
         published_unavailable=published_error,
         seed=seed,
-        held_out_seed=judged.seed,
         judged_gains={name: gains.gains_of(study(one).parts) for name, one in candidates.items()},
-        lower_bounds={name: judging.rms_lower_bound(one, judged.seed) for name, one in candidates.items()},
-        verdicts=judged.verdicts,
-        broken_by=_find_broken_requirements(candidates, held_out, judged.seed),
+        lower_bounds={name: judging.rms_lower_bound(one, judged.held_out_seed) for name, one in candidates.items()},
+        broken_by=_find_broken_requirements(candidates, held_out, judged.held_out_seed),
         shortest=shortest,
         trust=trust_checks,
         beyond=beyond_bounds,
@@ -205,7 +193,7 @@ def tune(
 
 def _search_and_judge(
     scenario: Scenario, setup: TuningSetup, journal: Journal | None, report: Report, tries: int
-) -> tuple[_Judged, list[RejectedSearch], TuningSetup]:
+) -> tuple[_Judged, TuningSetup]:
     """Search for gains, in wider bounds if gains end on default bounds, and judge them on held-out trials.
 
     If the gains break a limit there that the search kept, search again with more distance from the limits.
@@ -216,16 +204,19 @@ def _search_and_judge(
         setup.problem, setup.scenario_gains, starts, report=report, prepare=partial(_compile_judging, scenario)
     )
     outcome, setup = _search_in_wider_bounds(outcome, setup, journal, report)
-    search_again, seed = partial(setup.search, setup.problem, report=report), setup.seed
-    scenario = setup.ready.scenario
+    search_again = partial(setup.search, setup.problem, report=report)
     earlier = list[RejectedSearch]()
     while True:
         report("verifying on held-out trials", 0, 0, outcome.value, outcome.violation)
-        judged = _judge_outcome(scenario, setup, outcome, judging.derive_held_out_seed(seed, len(earlier)))
-        broken_ratios = _broken_ratios(outcome, judged.verdicts)
+        search_end, rounded = time.monotonic(), setup.rounded_gains(outcome.normalised)
+        tuned = judging.on_flight_clock(gains.in_scenario(setup.ready.scenario, rounded))
+        held_out_seed = judging.derive_held_out_seed(setup.seed, len(earlier))
+        trials = judging.judge(tuned, held_out_seed)
+        verdicts = judging.verdicts_of(tuned, trials, held_out_seed)
+        broken_ratios = _broken_ratios(outcome, verdicts)
         if not broken_ratios or outcome.interrupted or len(earlier) + 1 >= tries:
-            return judged, earlier, setup
-        earlier.append(RejectedSearch(judged.seed, judged.gains, outcome.margins, broken_ratios))
+            return _Judged(outcome, search_end, earlier, rounded, tuned, held_out_seed, trials, verdicts), setup
+        earlier.append(RejectedSearch(held_out_seed, rounded, outcome.margins, broken_ratios))
         reached = dict(zip(outcome.problem.rows, outcome.worst, strict=True))  # value over limit on the training trials
         margins = {name: 1.0 - float(reached[name]) / (EXTRA_DISTANCE * broken_ratios[name]) for name in broken_ratios}
         repeated = search_again(outcome.gains, starts, margins=outcome.margins | margins)
@@ -277,25 +268,15 @@ def _relevant_bounds(setup: TuningSetup, outcome: Search, sides: dict[str, str])
     return {name: side for (name, side), change in zip(sides.items(), changes[1:], strict=True) if change > trust.FLAT}
 
 
-def _judge_outcome(scenario: Scenario, setup: TuningSetup, outcome: Search, held_out_seed: int) -> _Judged:
-    """Simulate the rounded gains of a search on held-out trials."""
-    search_end = time.monotonic()
-    rounded = setup.rounded_gains(outcome.normalised)
-    simulated = judging.on_flight_clock(gains.in_scenario(scenario, rounded))
-    trials = judging.judge(simulated, held_out_seed)
-    verdicts = judging.verdicts_of(simulated, trials, held_out_seed)
-    return _Judged(outcome, rounded, simulated, held_out_seed, trials, verdicts, search_end)
-
-
 def _find_shortest_time(setup: TuningSetup, judged: _Judged) -> ShortestTime | None:
     """Return the shortest t_f [s] that the torque limit allows.
 
     The result is None if there is no torque limit, t_f is tuned, or the law has no prescribed time.
     """
     torque_limit = next((r for r in setup.ready.requirements if r.metric == "peak_torque"), None)
-    if torque_limit is None or T_F in setup.problem.names or not judged.scenario.controller.law.prescribed:
+    if torque_limit is None or T_F in setup.problem.names or not judged.tuned.controller.law.prescribed:
         return None
-    return shortest_time(judged.scenario, torque_limit, judged.seed, judged.trials.trial)
+    return shortest_time(judged.tuned, torque_limit, judged.held_out_seed, judged.trials.trial)
 
 
 def _find_broken_requirements(
@@ -335,7 +316,7 @@ def _check_result(setup: TuningSetup, judged: _Judged) -> Trust:
         gradient_error=gradient_error,
         profiles=trust.profiles(evaluate, outcome.problem, outcome.normalised),
         sensitivities=trust.sensitivities(outcome.problem, evaluate.bounds, outcome.gains, metrics),
-        margins=stability.worst_margins(study(judged.scenario)),
+        margins=stability.worst_margins(study(judged.tuned)),
     )
 
 
@@ -371,7 +352,7 @@ def _results_beyond_bounds(judged: _Judged, at_bound: dict[str, str]) -> dict[st
         judged: the tuned gains.
         at_bound: "lower" or "upper" for each gain on a bound, by its name.
     """
-    beyond, tuned = dict[str, BeyondBound](), judged.scenario
+    beyond, tuned = dict[str, BeyondBound](), judged.tuned
     if not tuned.sampled or tuned.search.minimise != "window_error":
         return beyond
     for name, side in at_bound.items():
@@ -380,25 +361,19 @@ def _results_beyond_bounds(judged: _Judged, at_bound: dict[str, str]) -> dict[st
             continue
         try:
             other = judging.on_flight_clock(gains.in_scenario(tuned, {**judged.gains, name: value}))
-            trials = judging.judge(other, judged.seed)
+            trials = judging.judge(other, judged.held_out_seed)
         except ScenarioError:  # no valid scenario beyond the bound
             continue
         both = trials.finished & judged.trials.finished
         error, tuned_error = (trust.rms(np.asarray(t.metrics.window_error)[both]) for t in (trials, judged.trials))
-        failure = _describe_failure(judging.verdicts_of(other, trials, judged.seed), trials)
+        verdicts, failures = judging.verdicts_of(other, trials, judged.held_out_seed), int(np.count_nonzero(~trials.ok))
+        broken = next((str(verdict) for verdict in verdicts if not verdict.met), None)
+        if broken is None and failures:
+            broken = f"{failures} of {trials.status.size} held-out trials fail"
         beyond[name] = BeyondBound(
-            value, float(error / tuned_error) if both.any() and tuned_error > 0.0 else None, failure
+            value, float(error / tuned_error) if both.any() and tuned_error > 0.0 else None, broken
         )
     return beyond
-
-
-def _describe_failure(verdicts: list[Verdict], trials: Trials) -> str | None:
-    """Return the first broken requirement, or the number of failed trials, in words; None: neither."""
-    for verdict in verdicts:
-        if not verdict.met:
-            return str(verdict)
-    failures = int(np.count_nonzero(~trials.ok))
-    return f"{failures} of {trials.status.size} held-out trials fail" if failures else None
 
 
 def _compile_judging(scenario: Scenario) -> None:
