@@ -106,7 +106,7 @@ def test_loss_is_continuous_and_gradient_is_finite_if_delta_is_a_multiple_of_the
 
 def test_bounds_map_normalised_gains_to_gains_and_back():
     some = normalisation.Bounds(("eta", "delta", "observer_gain"), (2.05, 0.05, 0.5), (8.0, 5.0, 300.0))
-    assert list(some.logarithmic) == [False, True, True]
+    assert list(some.scale.log) == [False, True, True]
     rng = np.random.default_rng(0)
     for normalised in rng.random((20, 3)):
         gains = np.asarray(some.gains(jnp.asarray(normalised)))
@@ -122,7 +122,7 @@ def test_bounds_map_normalised_gains_to_gains_and_back():
 
 def test_a_gain_that_may_be_negative_is_searched_on_a_linear_scale():
     some = normalisation.Bounds(("k", "lead"), (0.1, -1.0), (10.0, 3.0))
-    assert list(some.logarithmic) == [True, False]
+    assert list(some.scale.log) == [True, False]
     np.testing.assert_allclose(some.gains(jnp.asarray([0.5, 0.5])), [1.0, 1.0], rtol=1e-14)
     np.testing.assert_allclose(some.normalise(np.array([1.0, 0.0])), [0.5, 0.25], rtol=1e-14)
     assert some.at_bound(np.array([1.0, -1.0])) == {"lead": "lower"}

@@ -72,17 +72,13 @@ class Bounds:
     jump: float = 0.0  # [unit of s times unit of observer_gain]; 0: the lower bound of sign_width is fixed
 
     @property
-    def logarithmic(self) -> np.ndarray:
-        """Whether each gain is searched on a log scale, (gains,) bool."""
-        return is_log_scaled(np.asarray(self.lower), np.asarray(self.upper))
-
-    @property
     def scale(self) -> Scale:
         """The map from normalised gains to gains, for compiled programs."""
         observers = tuple(k for k, name in enumerate(self.names) if gain_names.base(name) == "observer_gain")
         width = self.names.index("sign_width") if self.jump else None
-        log = tuple(map(bool, self.logarithmic))
-        return Scale(np.asarray(self.lower), np.asarray(self.upper), np.asarray(self.jump), log, width, observers)
+        lower, upper = np.asarray(self.lower), np.asarray(self.upper)
+        log = tuple(map(bool, is_log_scaled(lower, upper)))
+        return Scale(lower, upper, np.asarray(self.jump), log, width, observers)
 
     def gains(self, normalised: Any) -> Any:
         """Return the gains of normalised gains, (gains,), see `Scale.gains`."""
