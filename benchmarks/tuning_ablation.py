@@ -107,14 +107,14 @@ def main() -> None:
         table = loaded.tune
         assert table is not None
         posed = posing.set_up_tuning(loaded, 0)
-        evaluate = posed.evaluate
+        evaluate, with_gradients = posed.evaluate, posed.settings.with_gradients
         for seed in range(seeds):
             for variant, inside in variants().items():
                 if (name, variant, seed) in done:
                     continue
                 started, before = time.monotonic(), (evaluate.rollouts, evaluate.gradients)
                 with inside():
-                    settings = optimise.Settings(table.starts, table.steps, seed, posed.with_gradients, judged=False)
+                    settings = optimise.Settings(table.starts, table.steps, seed, with_gradients, judged=False)
                     found = optimise.search(
                         evaluate, posed.problem, posed.ready.requirements, posed.scenario_gains, settings
                     )

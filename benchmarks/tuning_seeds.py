@@ -66,7 +66,7 @@ def main() -> None:
     for seed in range(first, end):
         started, before = time.monotonic(), (evaluate.rollouts, evaluate.gradients)
         settings = optimise.Settings(
-            table.starts, table.steps, seed, posed.with_gradients, table.worst_case, judged=False
+            table.starts, table.steps, seed, posed.settings.with_gradients, table.worst_case, judged=False
         )
         one = optimise.search(evaluate, problem, ready.requirements, scenario_gains, settings)
         took = time.monotonic() - started
@@ -81,7 +81,7 @@ def main() -> None:
     started = time.monotonic()
     if len(sys.argv) > 3:
         return
-    check = global_check.check(evaluate, best, 1, with_gradients=posed.with_gradients)
+    check = global_check.check(evaluate, best, 1, with_gradients=posed.settings.with_gradients)
     print(f"differential evolution: goal {check.value:.5e}, {check.rollouts} rollouts, "
           f"{time.monotonic() - started:.0f} s, gains {check.gains}")  # fmt: skip
     references = {"differential evolution's": check.value, "the better of both": min(check.value, best.value)}

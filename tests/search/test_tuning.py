@@ -478,7 +478,7 @@ def test_a_problem_with_fewer_trials_keeps_added_trials_and_fractions():
 def test_only_a_discontinuous_sign_leads_to_a_search_without_gradients(width, free, with_gradients):
     tables = {"loop": {"mode": "sampled"}, "controller": {"sign_width": width}, "tune": {"free": free, "trials": 4}}
     posed = posing.set_up_tuning(scenario.from_tables(tables), 0)
-    assert posed.with_gradients == with_gradients
+    assert posed.settings.with_gradients == with_gradients
     assert float(posed.problem.parts.controller.sign_width) == width
 
 

@@ -199,7 +199,9 @@ def test_refined_target_is_not_worse_than_the_known_feasible_gains(monkeypatch, 
             return problem
 
     monkeypatch.setattr(pareto, "LocalSearches", Found)
-    posed: Any = SimpleNamespace(evaluate=SimpleNamespace(measure=measured), with_gradients=True)
+    posed: Any = SimpleNamespace(
+        evaluate=SimpleNamespace(measure=measured), settings=SimpleNamespace(with_gradients=True)
+    )
     problem: Any = SimpleNamespace(rows=["peak_torque"])
     step = pareto._refine_gains(posed, problem, np.asarray([[1.0], [2.0], [4.0]]))
     assert step is not None

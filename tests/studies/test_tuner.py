@@ -102,12 +102,12 @@ def test_reach_covers_the_bounds_and_the_own_values_of_the_gains():
     wide = {"eta": [2.1, 9.0], "delta": [0.1, 4.0], "t_f": [20.0, 60.0], "observer_gain": [2.0, 50.0],
             "k1": [0.5, 7.0], "sign_width": [1e-4, 1e-2], "surface_rate": [0.2, 3.0]}  # fmt: skip
     made = scenario.from_tables({"controller": {"sign_width": 1e-3}, "tune": {"free": [*wide], "bounds": wide}})
-    reach = posing.tuning_reach(made, made.search)
+    reach = posing.tuning_reach(made)
     assert (reach.smallest_t_f, reach.t_f) == (20.0, 60.0)
     assert (reach.smallest_delta, reach.delta) == (0.05, 4.0)  # the scenario's own is shorter
     assert (reach.gain, reach.largest_gain) == (2.0, 50.0)
     assert (reach.k1, reach.sign_width, reach.surface_rate) == (7.0, 1e-4, 3.0)
-    assert posing.tuning_reach(made, made.search, t_f=99.0).t_f == 99.0
+    assert posing.tuning_reach(made, t_f=99.0).t_f == 99.0
 
 
 def test_single_nominal_trial_is_judged_without_the_quantile():
@@ -183,7 +183,8 @@ class Rising:
     """A problem of K1 and eta with F = -ln K1. A search ends at the upper bounds of both; eta has no effect."""
 
     def __init__(self, made: scenario.Scenario, searched: list[dict[str, tuple[float, float]]]):
-        self.ready, self.seed, self.with_gradients, self.problem = SimpleNamespace(scenario=made), 0, True, None
+        self.ready, self.problem = SimpleNamespace(scenario=made), None
+        self.settings = SimpleNamespace(seed=0, with_gradients=True)
         self.searched, names = searched, tuple(made.search.bounds)
         lower, upper = zip(*made.search.bounds.values(), strict=True)
         bounds = normalisation.Bounds(names, lower, upper)

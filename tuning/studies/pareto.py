@@ -49,7 +49,7 @@ def trace(trade: Trade, seed: int, report: Report = lambda *_: None, journal: Jo
     """
     setup = posing.set_up_tuning(trade.base, seed, journal, **trade.reach_overrides)
     overrides = trade.reach_overrides
-    reach = posing.tuning_reach(trade.base, trade.base.search, **overrides) if overrides else None
+    reach = posing.tuning_reach(trade.base, **overrides) if overrides else None
     targets, known_gains = trade.targets(setup, report)
     best = refine_targets(targets, known_gains, setup, report)
     chosen = drop_equal_gains(best) if trade.merges_points else best
@@ -130,7 +130,7 @@ def _refine_gains(setup: posing.TuningSetup, problem: Problem, known_gains: np.n
     starts = known_gains[np.lexsort((results.f, np.maximum(results.largest_c - NEARLY_FEASIBLE, 0.0)))[:WARM_STARTS]]
     best = Best(known_gains[0], len(problem.rows), MARGIN)
     best.offer(known_gains, results)
-    if setup.with_gradients:
+    if setup.settings.with_gradients:
         searches.search_locally(problem, dict(enumerate(starts)))
     else:
         searches.evolve(problem, starts[0], NEAR_BEST)

@@ -34,10 +34,8 @@ class TuningSetup:
     problem: Problem
     evaluate: Evaluator
     scenario_gains: np.ndarray  # (gains,) gains of the scenario
-    with_gradients: bool  # whether F has useful gradients; it has none with the discontinuous sign
+    settings: Settings  # options of the search; F has no useful gradients with the discontinuous sign
     constraints: list[Requirement]  # constraints of the search
-    seed: int
-    design_gains: np.ndarray  # (designs, gains) starting points that follow from the mission
 
     def search(
         self,
@@ -61,17 +59,8 @@ class TuningSetup:
             margins: distance from the limit of each metric as a fraction of the limit, see `Settings`.
             callbacks: `report` and `prepare` of `search`.
         """
-        table, constraints = self.ready.scenario.search, self.constraints if constraints is None else constraints
-        settings = Settings(
-            starts,
-            table.steps,
-            self.seed,
-            self.with_gradients,
-            table.worst_case,
-            judged,
-            margins or {},
-            self.design_gains,
-        )
+        constraints = self.constraints if constraints is None else constraints
+        settings = dataclasses.replace(self.settings, starts=starts, judged=judged, margins=margins or {})
         return search(self.evaluate, problem, constraints, gains, settings, **callbacks)
 
     def rounded_gains(self, normalised: np.ndarray) -> dict[str, float]:
@@ -102,7 +91,7 @@ def set_up_tuning(scenario: Scenario, seed: int, journal: Journal | None = None,
         overrides: see `tuning_reach`.
     """
     scenario, tune = on_training_clock(scenario), scenario.search
-    ready = study(scenario, reach=tuning_reach(scenario, tune, **overrides))
+    ready = study(scenario, reach=tuning_reach(scenario, **overrides))
     bounds = gain_bounds.bounds_of_scenario(scenario, ready.parts)
     requirements = [r.implied_by for r in ready.requirements]
     training_trials = judging.count_needed_trials(ready, tune.trials)
@@ -127,9 +116,8 @@ def set_up_tuning(scenario: Scenario, seed: int, journal: Journal | None = None,
     problem = dataclasses.replace(problem, margins=margin_rows.build_required_margins(ready, bounds, seed))
     scenario_gains = np.asarray(gains.present_values(ready.parts, bounds.names))
     designs = np.asarray(gains.design_gains(scenario, ready.parts, bounds.names))
-    return TuningSetup(
-        ready, problem, Evaluator(bounds, journal), scenario_gains, not is_discontinuous, requirements, seed, designs
-    )
+    settings = Settings(tune.starts, tune.steps, seed, not is_discontinuous, tune.worst_case, designs=designs)
+    return TuningSetup(ready, problem, Evaluator(bounds, journal), scenario_gains, settings, requirements)
 
 
 def on_training_clock(scenario: Scenario) -> Scenario:
@@ -142,19 +130,18 @@ def on_training_clock(scenario: Scenario) -> Scenario:
     return replace(scenario, loop__clock="anchored") if has_free_time else scenario
 
 
-def tuning_reach(scenario: Scenario, table: tables.Tune, **overrides: float) -> Reach:
+def tuning_reach(scenario: Scenario, **overrides: float) -> Reach:
     """Return the ranges of the free gains that one compiled program must cover.
 
     Args:
-        scenario: scenario whose gains the ranges include.
-        table: table [tune] whose bounds the ranges include.
+        scenario: scenario whose gains and bounds the ranges include.
         overrides: fields of `Reach` that get other values.
     """
     scenario_reach = reach_of(scenario)
 
     def covering_range(name: str, value: float, largest: float | None = None) -> tuple[float, float]:
         """Return the smallest range that includes the bounds of a gain and its values in the scenario."""
-        low, high = table.bounds.get(name, (value, value))
+        low, high = scenario.search.bounds.get(name, (value, value))
         return min(low, value), max(high, value if largest is None else largest)
 
     smallest_delta, delta = covering_range("delta", scenario_reach.delta)

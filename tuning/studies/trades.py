@@ -399,7 +399,7 @@ def _search(
         starts: number of starting points; None: as in the scenario.
         constraints: requirements that the search keeps; None: those of the scenario.
     """
-    starts = setup.ready.scenario.search.starts if starts is None else starts
+    starts = setup.settings.starts if starts is None else starts
     outcome = setup.search(problem, setup.scenario_gains, starts, constraints, judged=False, report=report)
     if outcome.interrupted:
         raise KeyboardInterrupt

@@ -154,7 +154,7 @@ def tune(
     outcome, rollouts, gradients = judged.search, evaluate.rollouts, evaluate.gradients
     check = None
     if with_global_check and not outcome.interrupted:
-        check = global_check.check(evaluate, outcome, seed, report, with_gradients=setup.with_gradients)
+        check = global_check.check(evaluate, outcome, seed, report, with_gradients=setup.settings.with_gradients)
     problem = setup.problem
     training = simulations.simulate_trials(
         problem.batch_of(np.arange(problem.averaged)), np.asarray([*judged.gains.values()])
@@ -210,7 +210,7 @@ def _search_and_judge(
         report("verifying on held-out trials", 0, 0, outcome.value, outcome.violation)
         search_end, rounded = time.monotonic(), setup.rounded_gains(outcome.normalised)
         tuned = judging.on_flight_clock(gains.in_scenario(setup.ready.scenario, rounded))
-        held_out_seed = judging.derive_held_out_seed(setup.seed, len(earlier))
+        held_out_seed = judging.derive_held_out_seed(setup.settings.seed, len(earlier))
         trials = judging.judge(tuned, held_out_seed)
         verdicts = judging.verdicts_of(tuned, trials, held_out_seed)
         broken_ratios = _broken_ratios(outcome, verdicts)
@@ -233,7 +233,7 @@ def _search_in_wider_bounds(
     """
     default_bounds = setup.ready.scenario.defaulted
     for _ in range(MOST_WIDENINGS):
-        if outcome.interrupted or not setup.with_gradients:
+        if outcome.interrupted or not setup.settings.with_gradients:
             break
         sides = _relevant_bounds(setup, outcome, setup.evaluate.bounds.at_bound(outcome.gains))
         scenario = setup.ready.scenario
@@ -243,7 +243,7 @@ def _search_in_wider_bounds(
         if not new_bounds:
             break
         report(f"searching beyond the bounds of {', '.join(new_bounds)}", 0, 0, outcome.value, outcome.violation)
-        wider = posing.set_up_tuning(posing.with_bounds(scenario, new_bounds), setup.seed, journal)
+        wider = posing.set_up_tuning(posing.with_bounds(scenario, new_bounds), setup.settings.seed, journal)
         wider.evaluate.continue_counts(setup.evaluate)
         repeated = wider.search(wider.problem, outcome.gains, 1, report=report)
         history = [*outcome.history, *_renumber_starts(outcome.history, repeated.history)]
@@ -308,7 +308,7 @@ def _check_result(setup: TuningSetup, judged: _Judged) -> Trust:
     """Compute gradient errors, profiles, sensitivities and margins of the gains found."""
     outcome, evaluate = judged.search, setup.evaluate
     gradient_error = None
-    if setup.with_gradients:
+    if setup.settings.with_gradients:
         at_start = trust.gradient_error(evaluate, outcome.problem, evaluate.bounds.normalise(setup.scenario_gains))
         gradient_error = at_start, trust.gradient_error(evaluate, outcome.problem, outcome.normalised)
     metrics = tuple(dict.fromkeys([*SENSITIVITY_METRICS, *outcome.problem.metrics]))
