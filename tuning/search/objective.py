@@ -302,19 +302,14 @@ def judge(
         value = jnp.log(gains[rules.names.index(T_F)])
         return value, constraints, value
     if rules.objective == LIMITS:
-        value = log_largest(constraints)
+        completed = jnp.where(constraints < FAILED - 1.0, constraints, -1.0)
+        value = jnp.log(jnp.maximum(1.0 + jnp.max(completed, initial=-1.0), LEAST))
         return value, constraints, value
     value = _log_statistic(values, rules.tail, rules.statistic)
     weighted = value + jnp.sum(values >= FAILED) * math.log(FAILED)
     if rules.torque_weight:
         weighted = weighted + rules.torque_weight * _log_statistic(torques, rules.tail, "rms")
     return weighted, constraints, value
-
-
-def log_largest(constraints: Array) -> Array:
-    """Return ln of the largest metric / limit of the completed trials, from c, (rows, trials)."""
-    completed = jnp.where(constraints < FAILED - 1.0, constraints, -1.0)
-    return jnp.log(jnp.maximum(1.0 + jnp.max(completed, initial=-1.0), LEAST))
 
 
 def mark_failures(value: Array, status: Array) -> Array:

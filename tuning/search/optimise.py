@@ -22,7 +22,6 @@ from tuning.search.worst import Hardest
 
 Announce = Callable[[str], None]  # reports the name of the current step
 
-GLOBAL_SEARCH = "no gains that meet every requirement are found yet: searching globally"
 HOPELESS = 1.1  # if the best gains have a larger metric / limit, no harder trials are added, because they cannot help
 
 
@@ -148,7 +147,7 @@ def _search_with_gradients(
     local_searches.search_locally(rounds.problem, best)
     _repeat_with_harder_trials(rounds, local_searches, local_searches.continue_best, announce)
     if starts > 1 and local_searches.best.violation > 0.0:
-        announce(GLOBAL_SEARCH)
+        announce("no gains that meet every requirement are found yet: searching globally")
         local_searches.search_globally(rounds.problem, starts, seed + 1)
         _repeat_with_harder_trials(rounds, local_searches, local_searches.continue_best, announce)
 
