@@ -4,7 +4,6 @@ Points are normalised gains, 0 at the lower bound and 1 at the upper bound. Read
 """
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,38 +16,32 @@ OTHER_HAND_OVERS = 16  # largest number of hand-overs from `other_hand_overs`
 DELTA_RATIO = 2.0  # largest ratio of their delta to the present delta, and inverse of the smallest ratio
 
 
-@dataclass(frozen=True)
-class _HandOver:
-    """The hand-over of one point of a search, in s."""
+def _find_hand_over(problem: Problem, bounds: Bounds, normalised: np.ndarray) -> tuple[float, float, float] | None:
+    """Return t_f, delta and the control period of a point [s].
 
-    normalised: np.ndarray  # (gains,) normalised gains
-    bounds: Bounds
-    gains: np.ndarray  # (gains,)
-    at: dict[str, int]  # indices of delta and t_f among the free gains
-    t_f: float
-    delta: float
-    period: float  # control period
-
-    def with_time(self, name: str, time: float) -> np.ndarray | None:
-        """Return the normalised gains with another time, or None if the time is outside its bounds."""
-        k = self.at[name]
-        if not self.bounds.lower[k] * (1 - 1e-9) <= time <= self.bounds.upper[k]:
-            return None
-        gains, point = self.gains.copy(), self.normalised.copy()
-        gains[k] = time
-        point[k] = self.bounds.normalise(gains)[k]
-        return point
-
-
-def _find_hand_over(problem: Problem, bounds: Bounds, normalised: np.ndarray) -> _HandOver | None:
-    """Return the hand-over of a point, or None if no free gain moves it or the clock is not anchored to it."""
+    The result is None if no free gain moves the hand-over or the clock is not anchored to it.
+    """
     clock: Any = problem.parts.clock
-    law, indices = problem.parts.controller, {name: k for k, name in enumerate(problem.names) if name in TIMES}
-    if not indices or not clock.anchored or "delta" not in law.tunable:  # a law without delta has no hand-over
-        return None
-    gains = bounds.gains(normalised)
-    t_f, delta = (float(gains[indices[name]] if name in indices else getattr(law, name)) for name in ("t_f", "delta"))
-    return _HandOver(normalised, bounds, gains, indices, t_f, delta, float(clock.period))
+    law, gains = problem.parts.controller, dict(zip(problem.names, bounds.gains(normalised), strict=True))
+    if not gains.keys() & set(TIMES) or not clock.anchored or "delta" not in law.tunable:
+        return None  # a law without delta has no hand-over
+    t_f, delta = (float(gains[name] if name in gains else getattr(law, name)) for name in ("t_f", "delta"))
+    return t_f, delta, float(clock.period)
+
+
+def _with_times(
+    problem: Problem, bounds: Bounds, normalised: np.ndarray, times: list[tuple[str, float]]
+) -> list[np.ndarray]:
+    """Return a point with each of these times [s] instead of its own, without the times outside their bounds."""
+    points = []
+    for name, time in times:
+        k = problem.names.index(name)
+        if bounds.lower[k] * (1 - 1e-9) <= time <= bounds.upper[k]:
+            gains, point = bounds.gains(normalised), normalised.copy()
+            gains[k] = time
+            point[k] = bounds.normalise(gains)[k]
+            points.append(point)
+    return points
 
 
 def points_on_samples(problem: Problem, bounds: Bounds, normalised: np.ndarray) -> list[np.ndarray]:
@@ -66,19 +59,18 @@ def points_on_samples(problem: Problem, bounds: Bounds, normalised: np.ndarray) 
         Normalised gains, (gains,) each. The list is empty if no free gain moves the hand-over or the clock is not
         anchored to it.
     """
-    now = _find_hand_over(problem, bounds, normalised)
-    if now is None:
+    hand_over = _find_hand_over(problem, bounds, normalised)
+    if hand_over is None:
         return []
-    samples, points = (now.t_f - now.delta) / now.period, list[np.ndarray | None]()
+    t_f, delta, period = hand_over
+    samples, times = (t_f - delta) / period, list[tuple[str, float]]()
     sample_before, sample_after = math.floor(samples + 1e-9), math.ceil(samples - 1e-9)
-    if "delta" in now.at:
-        points += [
-            now.with_time("delta", now.t_f - sample * now.period) for sample in sorted({sample_before, sample_after})
-        ]
-    if "t_f" in now.at:  # if t_f is as short as the limits allow, another delta may break a limit
+    if "delta" in problem.names:
+        times += [("delta", t_f - sample * period) for sample in sorted({sample_before, sample_after})]
+    if "t_f" in problem.names:  # if t_f is as short as the limits allow, another delta may break a limit
         samples_ahead = range(sample_before, sample_before + SAMPLES_AHEAD)
-        points += [now.with_time("t_f", sample * now.period + now.delta) for sample in samples_ahead]
-    return [point for point in points if point is not None]
+        times += [("t_f", sample * period + delta) for sample in samples_ahead]
+    return _with_times(problem, bounds, normalised, times)
 
 
 def other_hand_overs(problem: Problem, bounds: Bounds, normalised: np.ndarray) -> list[np.ndarray]:
@@ -92,12 +84,12 @@ def other_hand_overs(problem: Problem, bounds: Bounds, normalised: np.ndarray) -
     Returns:
         Normalised gains, (gains,) each. The list is empty if delta is not free.
     """
-    now = _find_hand_over(problem, bounds, normalised)
-    if now is None or "delta" not in now.at:
+    hand_over = _find_hand_over(problem, bounds, normalised)
+    if hand_over is None or "delta" not in problem.names:
         return []
-    k = now.at["delta"]
-    longest, shortest = (min(bounds.upper[k], DELTA_RATIO * now.delta), max(bounds.lower[k], now.delta / DELTA_RATIO))
-    first, last = ((now.t_f - delta) / now.period for delta in (longest, shortest))
+    (t_f, delta, period), k = hand_over, problem.names.index("delta")
+    longest, shortest = min(bounds.upper[k], DELTA_RATIO * delta), max(bounds.lower[k], delta / DELTA_RATIO)
+    first, last = ((t_f - other) / period for other in (longest, shortest))
     spread = np.linspace(math.ceil(first - 1e-9), math.floor(last + 1e-9), OTHER_HAND_OVERS)
-    points = [now.with_time("delta", now.t_f - sample * now.period) for sample in np.unique(np.round(spread)).tolist()]
-    return [point for point in points if point is not None]
+    times = [("delta", t_f - sample * period) for sample in np.unique(np.round(spread)).tolist()]
+    return _with_times(problem, bounds, normalised, times)
