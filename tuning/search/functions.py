@@ -117,68 +117,39 @@ def minimise(
     lower, upper = np.asarray(bounds, dtype=float).T
     if not np.all(np.isfinite(upper - lower) & (lower < upper)):
         raise ValueError(f"bounds are {list(bounds)}, but must be finite, each lower one below its upper one")
-    problem = _Problem(objective, constraints, lower, upper)
+
+    def to_box(normalised: Any) -> Any:
+        return lower + (upper - lower) * normalised
+
+    def evaluate(normalised: Array) -> tuple[Array, Array]:
+        x = to_box(normalised)
+        c = jnp.zeros(0) if constraints is None else jnp.ravel(constraints(x))
+        return jnp.asarray(objective(x), dtype=float), c[None][: min(1, c.size)]  # one row of c, or none
+
+    differentiate = jax.jit(lambda normalised: (evaluate(normalised), jax.jacfwd(evaluate)(normalised)))
+
+    def measure_with_gradients(normalised: np.ndarray) -> MeasurementWithGradients:
+        """Return the values and gradients at one point, (1, n)."""
+        (f, c), gradients = jax.tree.map(lambda v: np.asarray(v)[None], differentiate(normalised[0]))
+        return MeasurementWithGradients(normalised, f, c, np.zeros_like(f), *gradients)
+
     points = sobol_points(lower.size, settings.sampled, np.random.default_rng(settings.seed))
-    sampled = problem.measure(points)
-    finite = np.flatnonzero(np.isfinite(sampled.f))
+    f, c = map(np.asarray, jax.jit(jax.vmap(evaluate))(points))
+    finite = np.flatnonzero(np.isfinite(f))
     if not finite.size:
         raise ValueError(f"the objective is finite at none of {settings.sampled} points of the box")
-    scale = max(float(np.median(sampled.f[finite]) - sampled.f[finite].min()), np.finfo(float).tiny)
-    merits = penalise((sampled.f[finite] - sampled.f[finite].min()) / scale, sampled.largest_c[finite], 1.0)
+    scale = max(float(np.median(f[finite]) - f[finite].min()), np.finfo(float).tiny)
+    largest_c = Measurement(points, f, c, np.zeros_like(f)).largest_c[finite]
+    merits = penalise((f[finite] - f[finite].min()) / scale, largest_c, 1.0)
     order = finite[np.argsort(merits, kind="stable")].tolist()
-    bests = []
-    for k in choose_far_apart(order, distances(points), settings.starts):
-        best, start = Best(points[k], 1, 0.0), Start(points[k])
+    starts = [Start(points[k]) for k in choose_far_apart(order, distances(points), settings.starts)]
+    bests = [Best(start.normalised, 1, 0.0) for start in starts]
+    for best, start in zip(bests, starts, strict=True):
         search_locally(
-            problem.measure_with_gradients, best, start, settings.steps, tolerance=settings.tolerance, steepest=np.inf
+            measure_with_gradients, best, start, settings.steps, tolerance=settings.tolerance, steepest=np.inf
         )
-        bests.append(best)
     successful = sorted((best for best in bests if np.isfinite(best.f)), key=lambda best: best.rank)
     if not successful:  # no starting point has a finite gradient
         raise ValueError("the objective has a finite gradient at no starting point")
-    results = [Local(problem.x(best.normalised), best.f, best.violation) for best in successful]
-    return Search(results, settings.sampled, problem.gradients)
-
-
-class _Problem:
-    """An objective and its constraints as functions on the unit cube."""
-
-    def __init__(self, objective: Function, constraints: Constraints | None, lower: np.ndarray, upper: np.ndarray):
-        self._lower, self._upper, self.gradients = lower, upper, 0
-
-        def evaluate(normalised: Array) -> tuple[Array, Array]:
-            x = self.x(normalised)
-            c = jnp.zeros(0) if constraints is None else jnp.ravel(constraints(x))
-            return jnp.asarray(objective(x), dtype=float), c
-
-        self._evaluate = jax.jit(jax.vmap(evaluate))
-        self._differentiate = jax.jit(lambda normalised: (evaluate(normalised), jax.jacfwd(evaluate)(normalised)))
-
-    def x(self, normalised: Any) -> Any:
-        """Map a point of the unit cube to the box, (n,)."""
-        return self._lower + (self._upper - self._lower) * normalised
-
-    def measure(self, normalised: np.ndarray) -> Measurement:
-        """Return the values at many points, (points, n)."""
-        f, c = map(np.asarray, self._evaluate(normalised))
-        return Measurement(gains=normalised, f=f, c=_as_one_row(c), value=np.zeros_like(f))
-
-    def measure_with_gradients(self, normalised: np.ndarray) -> MeasurementWithGradients:
-        """Return the values and gradients at one point, (1, n)."""
-        self.gradients += 1
-        (f, c), (f_gradient, c_gradient) = jax.tree.map(
-            lambda v: np.asarray(v)[None], self._differentiate(normalised[0])
-        )
-        return MeasurementWithGradients(
-            gains=normalised,
-            f=f,
-            c=_as_one_row(c),
-            value=np.zeros_like(f),
-            f_gradient=f_gradient,
-            c_gradient=_as_one_row(c_gradient),
-        )
-
-
-def _as_one_row(c: np.ndarray) -> np.ndarray:
-    """Return constraints as one row of `Measurement.c`, (points, 1, constraints, ...), or no row if there are none."""
-    return c[:, None][:, : min(1, c.shape[1])]
+    results = [Local(to_box(best.normalised), best.f, best.violation) for best in successful]
+    return Search(results, settings.sampled, sum(len(start.measurements) for start in starts))
