@@ -370,28 +370,25 @@ class LocalSearches:
 
         The ratio is metric / limit. Every other limit is kept to 0.1 %. The ratio is None if that is impossible.
         """
-        tightened, smallest_ratios = self.tightened(problem), dict[str, float | None]()
+        tightened = self.tightened(problem)
         measure = partial(self._evaluate.measure_with_gradients, tightened)
         worst = largest_ratios(measure(self.normalised[None]).c, 0.0)[0]
-        for row in np.flatnonzero(worst >= 1.0 + (worst.max() - 1.0) * (1.0 - CONFLICTING)):
-            others = np.arange(worst.size) != row
-            ratios: list[tuple[float, float]] = []
 
-            def record_ratios(
-                measured: MeasurementWithGradients,
-                row: int = int(row),
-                others: np.ndarray = others,
-                ratios: list = ratios,
-            ) -> None:
+        def find_smallest_ratio(row: int) -> float | None:
+            others, ratios = np.arange(worst.size) != row, list[tuple[float, float]]()
+
+            def record_ratios(measured: MeasurementWithGradients) -> None:
                 row_ratios = largest_ratios(measured.c, 0.0)[0]
                 ratios.append((float(row_ratios[others].max(initial=0.0)), float(row_ratios[row])))
 
             best, start = self._new_best(tightened, self.normalised), Start(self.normalised, CAREFUL)
-            search_locally(measure, best, start, self._steps, record_ratios, relaxed=[int(row)])
+            search_locally(measure, best, start, self._steps, record_ratios, relaxed=[row])
             kept = [ratio for largest_other, ratio in ratios if largest_other <= 1.0 + 10.0 * SLACK]
             margin = float(np.broadcast_to(self._margin, worst.size)[row])
-            smallest_ratios[problem.rows[row]] = (1.0 - margin) * min(kept) if kept else None
-        return smallest_ratios
+            return (1.0 - margin) * min(kept) if kept else None
+
+        most_exceeded = np.flatnonzero(worst >= 1.0 + (worst.max() - 1.0) * (1.0 - CONFLICTING)).tolist()
+        return {problem.rows[row]: find_smallest_ratio(row) for row in most_exceeded}
 
     def _finish(self, problem: Problem) -> None:
         """Improve the best point: other hand-over times, a last local search, and gains reset to the scenario's."""
@@ -401,21 +398,17 @@ class LocalSearches:
                 break
         self._search(problem, self._best_start, Start(self.normalised, CAREFUL), self._steps, tolerance=FINAL_TOLERANCE)
         self._move_hand_over_to_sample(problem)
-        times = [k for k, name in enumerate(problem.names) if name in TIMES]
-        others = [k for k in range(len(problem.names)) if k not in times]
-        if self._scenario_gains is not None and others:
-            self._restore_scenario_gains(problem, self._scenario_gains, others)
+        self._restore_scenario_gains(problem)
 
-    def _restore_scenario_gains(self, problem: Problem, scenario_gains: np.ndarray, indices: Sequence[int]) -> None:
-        """Reset as many gains as possible to the scenario's values.
+    def _restore_scenario_gains(self, problem: Problem) -> None:
+        """Reset as many gains as possible, except for times, to the scenario's values.
 
         F may grow by `SAME_F`, and the violation may not grow.
-
-        Args:
-            problem: the tuning problem.
-            scenario_gains: (gains,) gains of the scenario.
-            indices: indices of the gains that may be reset.
         """
+        scenario_gains = self._scenario_gains
+        indices = [k for k, name in enumerate(problem.names) if name not in TIMES]
+        if scenario_gains is None or not indices:
+            return
         tightened, current = self.tightened(problem), self.best
 
         def measure_resets(resets: Sequence[Sequence[int]]) -> list[Best]:
