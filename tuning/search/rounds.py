@@ -103,7 +103,13 @@ class Rounds:
         with_worst_loops, loops_break_limits = _select_worst_loops(self.problem, gains)
         if self._quantiles:  # each confirmation uses new trials, which were not screened
             announce("confirming on other trials")
-            joining += self._confirm_quantiles(gains)
+            self.counts = self._count_violations(gains)
+            rows = np.arange(len(self.problem.metrics))
+            joining += [  # the worst violators of each requirement whose confirmation failed
+                Joining(one.surplus_violators[:HARDEST], rows == k)
+                for k, one in zip(self._quantiles, self.counts, strict=True)
+                if not one.confirmed
+            ]
         if self._on_every_trial and self._robust:
             announce("looking for the worst case")
             self.hardest = worst_case.find_hardest(self.problem, self._on_every_trial, gains, self._screen(gains))
@@ -150,16 +156,6 @@ class Rounds:
         self._evaluate.rollouts += counts[0].trials
         return counts
 
-    def _confirm_quantiles(self, gains: np.ndarray) -> list[Joining]:
-        """Return the worst violators of each quantile requirement whose confirmation failed."""
-        self.counts = self._count_violations(gains)
-        rows = np.arange(len(self.problem.metrics))
-        return [
-            Joining(one.surplus_violators[:HARDEST], rows == k)
-            for k, one in zip(self._quantiles, self.counts, strict=True)
-            if not one.confirmed
-        ]
-
     def _join(self, joining: Joining) -> None:
         """Put trials into the next slots of the problem. If all slots are full, they replace the oldest trials."""
         slots = self._slots[(self._joined + np.arange(joining.trials.size)) % self._slots.size]
@@ -182,8 +178,16 @@ def _select_worst_loops(problem: Problem, gains: np.ndarray) -> tuple[Problem, b
 
 def _fill_slots(problem: Problem, slots: np.ndarray, joining: Joining) -> Problem:
     """Return the problem with more trials in these slots."""
-    replaced = _replace_trials(problem, slots, joining.trials, joining.coordinates)
-    return replace(replaced, counted=replace_entries(replaced.counted, np.s_[:, slots], joining.counted[:, None]))
+    if joining.coordinates is None:
+        added = coordinates_of(problem.dispersion, int(problem.seed), joining.trials)
+    else:
+        added = {name: np.asarray(v)[None] for name, v in joining.coordinates.items()}
+    return replace(
+        problem,
+        trials=replace_entries(problem.trials, slots, joining.trials),
+        coordinates={name: replace_entries(v, slots, added[name]) for name, v in problem.coordinates.items()},
+        counted=replace_entries(problem.counted, np.s_[:, slots], joining.counted[:, None]),
+    )
 
 
 def _with_bands(problem: Problem, bands: Mapping[int, np.ndarray]) -> Problem:
@@ -193,31 +197,13 @@ def _with_bands(problem: Problem, bands: Mapping[int, np.ndarray]) -> Problem:
     """
     for turn, (row, band) in enumerate(bands.items(), start=1):
         slots = problem.trials.size - turn * BAND_SIZE + np.arange(band.size)
-        problem = _replace_trials(problem, slots, band)
+        problem = _fill_slots(problem, slots, Joining(band, kept_by_every_trial(problem)))
         problem = replace(
             problem,
             quantile_sample=replace_entries(problem.quantile_sample, np.s_[row, slots], True),
             counted=replace_entries(problem.counted, np.s_[row, : problem.averaged], False),
         )
     return problem
-
-
-def _replace_trials(
-    problem: Problem, slots: np.ndarray, trials: np.ndarray, coordinates: Mapping[str, list[float]] | None = None
-) -> Problem:
-    """Return the problem with other trials in these slots.
-
-    If coordinates are given, they replace the dispersions of a single trial.
-    """
-    if coordinates is None:
-        added = coordinates_of(problem.dispersion, int(problem.seed), trials)
-    else:
-        added = {name: np.asarray(v)[None] for name, v in coordinates.items()}
-    return replace(
-        problem,
-        trials=replace_entries(problem.trials, slots, trials),
-        coordinates={name: replace_entries(v, slots, added[name]) for name, v in problem.coordinates.items()},
-    )
 
 
 def _select_hardest(problem: Problem, trials: np.ndarray, ratio: np.ndarray) -> np.ndarray:
