@@ -64,12 +64,10 @@ def differentiable_dispersions(dispersion: Dispersion) -> tuple[str, ...]:
 
 def simulate(batch: Batch, gains: np.ndarray) -> Simulated:
     """Simulate the trials at every point of gains, (points, gains). Return arrays (points, trials)."""
-    rows = _Rows(len(gains), len(batch.trials), ROWS)
-
-    def simulate_rows(arguments: dict[str, Any], needed_rows: np.int32) -> Simulated:
-        return _simulate(*batch.shared, arguments, needed_rows, batch.names, batch.pointing, rows.devices)
-
-    return rows.apply(simulate_rows, {"gains": gains}, batch.by_trial)
+    rows = _Rows({"gains": gains}, batch.by_trial, ROWS)
+    return rows.apply(
+        lambda *arguments: _simulate(*batch.shared, *arguments, batch.names, batch.pointing, rows.devices)
+    )
 
 
 def simulate_trials(batch: Batch, gains: np.ndarray) -> Trials:
@@ -97,14 +95,12 @@ def simulate_with_derivatives(
     Returns:
         Metrics, statuses and derivatives.
     """
-    rows, count = _Rows(len(gains), len(batch.trials), ROWS_WITH_DERIVATIVES), directions.shape[1]
-    shifts = _no_shifts(batch, count) if shifts is None else shifts
-
-    def simulate_rows(arguments: dict[str, Any], needed_rows: np.int32) -> tuple[jax.Array, jax.Array]:
-        return _simulate_with_derivatives(*batch.shared, arguments, needed_rows, batch.names, metrics, rows.devices)
-
+    shifts = _no_shifts(batch, directions.shape[1]) if shifts is None else shifts
     by_point = {"gains": gains, "directions": directions}
-    values, derivatives = rows.apply(simulate_rows, by_point, {**batch.by_trial, "shifts": dict(shifts)})
+    rows = _Rows(by_point, {**batch.by_trial, "shifts": dict(shifts)}, ROWS_WITH_DERIVATIVES)
+    values, derivatives = rows.apply(
+        lambda *arguments: _simulate_with_derivatives(*batch.shared, *arguments, batch.names, metrics, rows.devices)
+    )
     return Derivatives(values[..., :-1], values[..., -1].astype(int), derivatives[..., :-1])
 
 
@@ -118,58 +114,50 @@ def _no_shifts(batch: Batch, directions: int) -> dict[str, np.ndarray]:
 
 def prepare(batch: Batch, metrics: tuple[str, ...]) -> None:
     """Compile the programs of `simulate`, and of `simulate_with_derivatives` along all gains, in the background."""
-    count, trials = len(batch.names), len(batch.trials)
-    rows, gains = _Rows(1, trials, ROWS), {"gains": np.zeros((1, count))}
-    arguments, needed_rows = rows.call_arguments(0, gains, batch.by_trial)
-    _simulate.prepare(*batch.shared, arguments, np.int32(needed_rows), batch.names, batch.pointing, rows.devices)
-    rows = _Rows(1, trials, ROWS_WITH_DERIVATIVES)
+    count = len(batch.names)
+    gains = {"gains": np.zeros((1, count))}
+    rows = _Rows(gains, batch.by_trial, ROWS)
+    _simulate.prepare(*batch.shared, *rows.call_arguments(0), batch.names, batch.pointing, rows.devices)
     by_point = {**gains, "directions": np.zeros((1, count, count))}
-    arguments, needed_rows = rows.call_arguments(0, by_point, {**batch.by_trial, "shifts": _no_shifts(batch, count)})
-    _simulate_with_derivatives.prepare(
-        *batch.shared, arguments, np.int32(needed_rows), batch.names, metrics, rows.devices
-    )
+    rows = _Rows(by_point, {**batch.by_trial, "shifts": _no_shifts(batch, count)}, ROWS_WITH_DERIVATIVES)
+    _simulate_with_derivatives.prepare(*batch.shared, *rows.call_arguments(0), batch.names, metrics, rows.devices)
 
 
 class _Rows:
     """Splits the trials of all points into rows of `ROW` trials, and the rows into calls of a program.
 
-    A call has at most `max_rows` rows for each device.
+    A call has at most `max_rows` rows for each device. The arguments of the program have points on the first axis
+    (`by_point`), or trials (`by_trial`).
     """
 
-    def __init__(self, points: int, trials: int, max_rows: int):
+    def __init__(self, by_point: dict[str, Any], by_trial: dict[str, Any], max_rows: int):
         self.devices = len(configure.devices())
-        self._points, self._count, self._max_rows = points, trials, max_rows
+        self._by_point, self._by_trial, self._max_rows = by_point, by_trial, max_rows
+        self._points, self._count = len(by_point["gains"]), len(by_trial["trial"])
         # indices of the trials in the rows of one point
-        self._trials = np.resize(np.arange(trials), (max(1, -(-trials // ROW)), ROW))
-        self._rows = points * len(self._trials)
+        self._trials = np.resize(np.arange(self._count), (max(1, -(-self._count // ROW)), ROW))
+        self._rows = self._points * len(self._trials)
 
-    def call_arguments(
-        self, first: int, by_point: dict[str, Any], by_trial: dict[str, Any]
-    ) -> tuple[dict[str, Any], int]:
-        """Return the arguments of one call, (devices, rows, ..), and the number of rows of a device.
-
-        Args:
-            first: index of the first row of the call.
-            by_point: arguments with points on the first axis.
-            by_trial: arguments with trials on the first axis.
-        """
+    def call_arguments(self, first: int) -> tuple[dict[str, Any], np.int32]:
+        """Return the arguments of the call from row `first` on, (devices, rows, ..), and the rows of each device."""
         count = min(self._rows - first, self.devices * self._max_rows)
         places, needed_rows = montecarlo.scatter(count, self.devices, self._max_rows)
         point, row = np.divmod(first + places, len(self._trials))
         trial = self._trials[row]
-        by_row = {name: np.asarray(v)[point] for name, v in by_point.items()}
-        return by_row | jax.tree.map(lambda v: np.asarray(v)[trial], by_trial), needed_rows
+        by_row = {name: np.asarray(v)[point] for name, v in self._by_point.items()}
+        by_row |= jax.tree.map(lambda v: np.asarray(v)[trial], self._by_trial)
+        return by_row, np.int32(needed_rows)
 
-    def apply(self, program: Callable, by_point: dict[str, Any], by_trial: dict[str, Any]) -> Any:
+    def apply(self, program: Callable) -> Any:
         """Apply a program to all rows. Return arrays (points, trials, ..).
 
         The program gets the arguments of one call and the number of rows of each device that it must simulate.
         """
         calls = []
         for first in range(0, self._rows, self.devices * self._max_rows):
-            arguments, needed_rows = self.call_arguments(first, by_point, by_trial)
-            results = program(arguments, np.int32(needed_rows))
-            calls.append(jax.tree.map(lambda v, needed_rows=needed_rows: montecarlo.gather(v, needed_rows), results))
+            arguments, needed_rows = self.call_arguments(first)
+            results = program(arguments, needed_rows)
+            calls.append(jax.tree.map(lambda v, rows=int(needed_rows): montecarlo.gather(v, rows), results))
 
         def join_calls(*calls: np.ndarray) -> np.ndarray:
             rows = np.concatenate(calls)[: self._rows]
