@@ -3,7 +3,7 @@
 Read `gradient_error` and `profiles` first.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -143,12 +143,7 @@ def rms(values: np.ndarray, axis: int = -1) -> Any:
     return np.sqrt(np.mean(values**2, axis=axis))
 
 
-def mean(values: np.ndarray, axis: int = -1) -> Any:
-    """Return the mean along an axis: the default statistic of `interval`."""
-    return np.mean(values, axis=axis)
-
-
-def interval(values: np.ndarray, statistic=mean) -> tuple[float, float] | None:
+def interval(values: np.ndarray, statistic: Callable = np.mean) -> tuple[float, float] | None:
     """Return the bootstrap confidence interval of a statistic of values (trials,).
 
     The interval is bias-corrected and accelerated (Efron, JASA 82, 1987) at the level `CONFIDENCE`. It is None for

@@ -19,7 +19,12 @@ from tuning.search.local_searches import Step
 from tuning.studies import judging
 from tuning.studies.tuner import BeyondBound, Trust, Tuning
 
-INTERVAL_STATISTICS = {"window_error": "rms", "peak_torque": "mean", "effort": "mean"}  # statistics with an interval
+# statistics with a confidence interval
+INTERVAL_STATISTICS = {
+    "window_error": ("rms", trust.rms),
+    "peak_torque": ("mean", np.mean),
+    "effort": ("mean", np.mean),
+}
 
 
 def statistics(trials: Trials, kind: str) -> dict[str, Any]:
@@ -47,8 +52,8 @@ def statistics(trials: Trials, kind: str) -> dict[str, Any]:
         if known_values.size < values.size:
             results[name]["without_value"] = int(values.size - known_values.size)
         if name in INTERVAL_STATISTICS:
-            statistic = INTERVAL_STATISTICS[name]
-            results[name][f"{statistic}_interval"] = trust.interval(known_values, getattr(trust, statistic))
+            label, statistic = INTERVAL_STATISTICS[name]
+            results[name][f"{label}_interval"] = trust.interval(known_values, statistic)
     return results
 
 
@@ -122,12 +127,9 @@ def _accuracy_gain(held_out: Mapping[str, Trials]) -> dict[str, Any]:
 
     The ratio is over the trials that reach their end with both sets of gains.
     """
-    no_gain = {"accuracy_gain_over_published": None, "accuracy_gain_interval": None}
-    if "published" not in held_out:
-        return no_gain
-    both = held_out["tuned"].finished & held_out["published"].finished
+    both = held_out["tuned"].finished & held_out["published"].finished if "published" in held_out else np.zeros(0, bool)
     if not both.any():
-        return no_gain
+        return {"accuracy_gain_over_published": None, "accuracy_gain_interval": None}
     published, tuned = (np.asarray(held_out[name].metrics.window_error)[both] for name in ("published", "tuned"))
     return {
         "accuracy_gain_over_published": trust.rms(published) / trust.rms(tuned),
