@@ -127,7 +127,10 @@ def find_hardest(
     for _ in range(STEPS + 1 if moved else 0):
         ascended, state = _ascend(y, evaluate(y), state)
         y = np.asarray(ascended)
-    balls = _normal_balls(problem, moved)
+    places, kinds = _variable_slices(problem.coordinates, moved), problem.dispersion.kinds
+    # slice of the variables of each normal dispersion, and radius of its ball
+    balls = [(place, _ball_radius(place.stop - place.start))
+             for name, place in places.items() if kinds[name].drawn != "uniform"]  # fmt: skip
     y = _move_into_balls(best_y, balls)
     for _ in range(MEAN_VALUE_STEPS + 1 if balls else 0):
         y = _move_into_balls(y, balls, evaluate(y))
@@ -167,13 +170,6 @@ def _variable_slices(coordinates: Coordinates, names: tuple[str, ...]) -> dict[s
     counts = [coordinates[name].shape[1] for name in names]
     ends = np.cumsum(counts, dtype=int).tolist()
     return {name: slice(end - count, end) for name, count, end in zip(names, counts, ends, strict=True)}
-
-
-def _normal_balls(problem: Problem, moved: tuple[str, ...]) -> list[tuple[slice, float]]:
-    """Return the slice of the variables of each normal dispersion, and the radius of its ball."""
-    places, kinds = _variable_slices(problem.coordinates, moved), problem.dispersion.kinds
-    return [(place, _ball_radius(place.stop - place.start))
-            for name, place in places.items() if kinds[name].drawn != "uniform"]  # fmt: skip
 
 
 def _ball_radius(count: int) -> float:
@@ -229,8 +225,10 @@ def ratio_with_gradient(
     batch, count, width = batch._replace(coordinates=coordinates), y.shape[1], len(batch.names)
     columns, limit = [metrics.index(name) for name in limits], np.asarray([*limits.values()], dtype=float)
     value, gradients = np.zeros(len(y)), list[np.ndarray]()
+    # zeros for the unused directions of the last call
+    padded_shifts = {name: np.pad(v, [(0, 0), (0, -count % width), (0, 0)]) for name, v in shifts.items()}
     for k in range(0, count, width):
-        shift = {name: _pad_directions(v[:, k : k + width], width) for name, v in shifts.items()}
+        shift = {name: v[:, k : k + width] for name, v in padded_shifts.items()}
         simulated = jax.tree.map(
             lambda v: v[0],
             simulations.simulate_with_derivatives(batch, gains[None], np.zeros((1, width, width)), metrics, shift),
@@ -241,11 +239,6 @@ def ratio_with_gradient(
         gradient = np.take_along_axis(simulated.derivatives[:, :, columns], closest[:, None, None], axis=2)[:, :, 0]
         gradients.append(np.where(value[:, None] < FAILED, gradient / (limit + (limit == 0.0))[closest][:, None], 0.0))
     return value, np.concatenate(gradients, axis=1)[:, :count]
-
-
-def _pad_directions(v: np.ndarray, width: int) -> np.ndarray:
-    """Append zeros for unused directions, (cases, directions, ..)."""
-    return np.concatenate([v, np.zeros((v.shape[0], width - v.shape[1], *v.shape[2:]))], axis=1)
 
 
 def _coordinates_at(batch: Batch, y: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
