@@ -303,7 +303,8 @@ def rivals(monkeypatch, eight, interrupt=None):
 
 def test_all_laws_are_tuned_by_one_seed_and_judged_by_another(monkeypatch, eight):
     asked = rivals(monkeypatch, eight)
-    made = compare.compare(scenario.from_tables(TABLES), 5, lambda *told: None)
+    base = scenario.from_tables(TABLES)
+    made = compare.compare(base, 5, lambda *told: None, None, compare.validated_contenders(base))
     assert asked == [("judge", "published", judging.derive_held_out_seed(5)),
                      *(("tune", law, 5) for law in compare.law_kinds())]  # fmt: skip
     assert made.status == "met"
@@ -316,7 +317,8 @@ def test_all_laws_are_tuned_by_one_seed_and_judged_by_another(monkeypatch, eight
 
 def test_an_interruption_ends_the_comparison(monkeypatch, eight):
     asked = rivals(monkeypatch, eight, interrupt="pd")
-    made = compare.compare(scenario.from_tables(TABLES), 5, lambda *told: None)
+    base = scenario.from_tables(TABLES)
+    made = compare.compare(base, 5, lambda *told: None, None, compare.validated_contenders(base))
     assert made.status == "interrupted"
     assert [law for what, law, _ in asked if what == "tune"] == ["prescribed_time", "pd"]
 
@@ -326,7 +328,7 @@ def test_scenario_that_a_law_cannot_control_is_refused_before_any_search(monkeyp
     opposite = {"initial": {"rotvec_deg": [0.0, 0.0, 90.0]}, "reference": {"rotvec_deg": [0.0, 0.0, -90.0]}}
     tables = {name: table for name, table in TABLES.items() if name != "dispersion"} | opposite
     with pytest.raises(ScenarioError, match=r"the law terminal cannot be used in this scenario: .*q_e4 = 0"):
-        compare.compare(scenario.from_tables(tables), 0, lambda *told: None)
+        compare.validated_contenders(scenario.from_tables(tables))
     assert not asked
 
 

@@ -19,8 +19,8 @@ from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.figures import study_plots, style
 from ptsmc_jax.numerics.statistics import has_variation, sample_quantile
-from ptsmc_jax.scenario import custom, errors, free_gains, parsing, plausibility, replace, study, systems, tables
-from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.scenario import custom, free_gains, parsing, plausibility, replace, study, systems, tables
+from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.law_tables import LAWS, common_keys
 from ptsmc_jax.scenario.spacecraft_scenario import SpacecraftScenario
 from ptsmc_jax.scenario.tables import Scenario
@@ -79,14 +79,10 @@ class Comparison:
 def check(scenario: Scenario) -> None:
     """Raise ScenarioError if the other laws cannot control the plant or the loop of the scenario."""
     if scenario.motion != "spacecraft":
-        kind = errors.show(scenario.plant.kind)
-        raise ScenarioError(
-            f'plant.kind is {kind}, but must be "spacecraft", because the comparison changes the inertia; for another '
-            "plant use ptsmc tune for one law at a time"
-        )
+        allowed = '"spacecraft", because the comparison changes the inertia; for another plant use ptsmc tune'
+        raise wrong("plant.kind", scenario.plant.kind, f"{allowed} for one law at a time")
     if not scenario.sampled:
-        mode = errors.show(scenario.loop.mode)
-        raise ScenarioError(f'loop.mode is {mode}, but must be "sampled": the other laws need the sampled loop')
+        raise wrong("loop.mode", scenario.loop.mode, '"sampled": the other laws need the sampled loop')
 
 
 def law_kinds() -> list[str]:
@@ -120,21 +116,16 @@ class Rivals:
         """The keys of the table [controller] that select each law, by its label, the prescribed-time law first."""
         kinds = law_kinds() if self.kinds is None else [OURS, *self.kinds]
         tables = {kind: {"kind": kind} for kind in kinds}
-        for code in self._codes:
+        for code in self.codes:
             tables[_unique_label(code.rpartition(":")[2], tables)] = {"kind": "custom", "code": code}
         return tables
 
     @property
-    def _codes(self) -> list[str]:
+    def codes(self) -> list[str]:
         """The locations of the custom laws with symbolic links resolved, without duplicates."""
         parts = (location.rpartition(":") for location in self.custom)
         codes = (f"{os.path.realpath(at)}:{name}" if at.endswith(".py") else f"{at}:{name}" for at, _, name in parts)
         return list(dict.fromkeys(codes))
-
-    def identity(self) -> dict[str, Any]:
-        """Return the entries of `versions.json` that identify these laws; empty for the default laws."""
-        checksums = {code: systems.checksum(code) for code in self._codes}
-        return {"laws": list(self.law_tables), "custom_laws": checksums} if self != Rivals() else {}
 
 
 def _unique_label(name: str, labels: Iterable[str]) -> str:
@@ -241,8 +232,8 @@ def compare(
     scenario: Scenario,
     seed: int,
     report: Report,
-    journal: Journal | None = None,
-    rivals: Mapping[str, Scenario] | None = None,
+    journal: Journal | None,
+    rivals: Mapping[str, Scenario],
 ) -> Comparison:
     """Tune every law, and judge the tuned laws and the published gains on the same held-out trials.
 
@@ -251,22 +242,24 @@ def compare(
         seed: seed of the searches. The seed of the held-out trials follows from it.
         report: called with the progress after every step.
         journal: evaluations of an interrupted comparison, which then resumes.
-        rivals: the scenario with each law, as `validated_contenders` returns it; None: all built-in laws.
+        rivals: the scenario with each law, as `validated_contenders` returns it.
 
     Returns:
         The results of each law. If the comparison is interrupted, the laws after the interruption are missing.
 
-    Raises:
-        ScenarioError: a law cannot control the scenario.
     """
     held_out_seed = judging.derive_held_out_seed(seed)
-    rivals = validated_contenders(scenario) if rivals is None else rivals
     references, published_error = judging.reference_scenarios(scenario)
     results, interrupted = {}, False
     if PUBLISHED in references:
         report("published gains: verifying on held-out trials", 0, 0, np.nan, 0.0)
-        judged = _judge_published(judging.on_flight_clock(references[PUBLISHED]), held_out_seed)
-        results[PUBLISHED] = _add_margins_and_model_errors(judged, held_out_seed)
+        simulated = judging.on_flight_clock(references[PUBLISHED])
+        trials = judging.judge(simulated, held_out_seed)
+        verdicts = judging.verdicts_of(simulated, trials, held_out_seed)
+        lower_bound = judging.rms_lower_bound(simulated, held_out_seed)
+        published_gains = gains.gains_of(study(simulated).parts)
+        published = Contender(simulated, published_gains, {}, trials, verdicts, lower_bound)
+        results[PUBLISHED] = _add_margins_and_model_errors(published, held_out_seed)
     for number, (law, candidate) in enumerate(rivals.items(), 1):
         law_report = headed(report, f"{law}, law {number} of {len(rivals)}")
         # more tries would judge the laws on different held-out trials
@@ -279,13 +272,6 @@ def compare(
         law_report("simulating a wrong inertia and a longer delay", 0, 0, np.nan, 0.0)
         results[law] = _add_margins_and_model_errors(results[law], held_out_seed)
     return Comparison(results, held_out_seed, interrupted, published_error)
-
-
-def _judge_published(simulated: Scenario, held_out_seed: int) -> Contender:
-    trials = judging.judge(simulated, held_out_seed)
-    verdicts = judging.verdicts_of(simulated, trials, held_out_seed)
-    lower_bound = judging.rms_lower_bound(simulated, held_out_seed)
-    return Contender(simulated, gains.gains_of(study(simulated).parts), {}, trials, verdicts, lower_bound)
 
 
 def contender_results(contender: Contender) -> dict[str, Any]:
@@ -445,4 +431,6 @@ def identity(scenario: Scenario, seed: int, against: Rivals = Rivals()) -> dict[
         seed: seed of the searches.
         against: the other laws.
     """
-    return {"command": "compare", "seed": seed, **custom.checksums(scenario), **against.identity()}
+    checksums = {code: systems.checksum(code) for code in against.codes}
+    laws = {"laws": list(against.law_tables), "custom_laws": checksums} if against != Rivals() else {}
+    return {"command": "compare", "seed": seed, **custom.checksums(scenario), **laws}
