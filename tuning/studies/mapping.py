@@ -35,12 +35,7 @@ class Axis:
 
     key: str
     values: tuple[float, ...]
-    span: str = ""  # LOW:HIGH:COUNT of the option, if it cannot be derived from the values
-
-    @property
-    def text(self) -> str:
-        """The axis in the format of the option, which `parse_axis` parses."""
-        return f"{self.key}={self.span or f'{self.values[0]:g}:{self.values[-1]:g}:{len(self.values)}'}"
+    text: str  # the value of the option, see `parse_axis`
 
     @property
     def logarithmic(self) -> bool:
@@ -106,7 +101,7 @@ def parse_axis(text: str, option: str) -> Axis:
         raise UsageError(message) from None
     if not (np.isfinite(low) and np.isfinite(high) and low < high and 2 <= count <= 100):
         raise UsageError(f"{message}, with LOW below HIGH and COUNT from 2 to 100")
-    spacing = np.geomspace if Axis(key, (low, high)).logarithmic else np.linspace
+    spacing = np.geomspace if Axis(key, (low, high), text).logarithmic else np.linspace
     values = spacing(low, high, count)
     if key in WHOLE_NUMBERS:
         values = np.round(values)
@@ -114,7 +109,7 @@ def parse_axis(text: str, option: str) -> Axis:
     if len(distinct) < 2:  # a map needs at least two values
         needed = "two whole numbers" if key in WHOLE_NUMBERS else "two values that differ in six digits"
         raise UsageError(f"{message}, with {needed} between LOW and HIGH at least")
-    return Axis(key, distinct, span if len(distinct) < count or key in WHOLE_NUMBERS else "")
+    return Axis(key, distinct, text)
 
 
 def default_period_axis(scenario: Scenario) -> str:
@@ -169,13 +164,17 @@ def simulate(scenario: Scenario, x: Axis, y: Axis, seed: int, trials: int, repor
     valid = [candidate for candidate in studies if isinstance(candidate, Study)]
     if not valid:
         raise ScenarioError(str(studies[0]))
-    set_common_clock = _common_clock_setter([candidate.parts for candidate in valid])
+    # one compiled program simulates all pairs, with clocks of equal size and equally many substeps
+    substeps = max(candidate.parts.substeps for candidate in valid)
+    clocks = [candidate.parts.clock for candidate in valid]
     cells = []
     for k, ((a, b), candidate) in enumerate(zip(pairs, studies, strict=True)):
         if isinstance(candidate, str):
             cells.append(Cell(a, b, candidate))
         else:
-            cells.append(_simulate_pair(a, b, candidate, set_common_clock, seed, trials))
+            clock = candidate.parts.clock.long_enough_for(clocks)
+            parts = replace(candidate.parts, clock=clock, substeps=substeps)
+            cells.append(_simulate_pair(a, b, candidate, parts, seed, trials))
         report(k + 1, len(pairs))
     return Map(scenario, x, y, cells)
 
@@ -217,20 +216,9 @@ def _with_keys(scenario: Scenario, values: dict[str, float]) -> Scenario:
     return replace_keys(scenario, **changes)
 
 
-def _common_clock_setter(parts: list[Parts]) -> Callable[[Parts], Parts]:
-    """Return a function that gives all parts clocks of equal size and equally many substeps.
-
-    One compiled program then simulates all of them.
-    """
-    substeps, clocks = max(p.substeps for p in parts), [p.clock for p in parts]
-    return lambda one: replace(one, clock=one.clock.long_enough_for(clocks), substeps=substeps)
-
-
-def _simulate_pair(
-    x: float, y: float, ready: Study, set_common_clock: Callable[[Parts], Parts], seed: int, trials: int
-) -> Cell:
+def _simulate_pair(x: float, y: float, ready: Study, parts: Parts, seed: int, trials: int) -> Cell:
+    """Return the results of a pair of values; parts: the parts of `ready` on the clock of all pairs."""
     count = judging.count_needed_trials(ready, trials)
-    parts = set_common_clock(ready.parts)
     simulated = montecarlo.run(parts, ready.dispersion, seed, np.arange(count))
     finished, counts = simulated.finished, simulated.counts()
     errors, peaks = simulated.metrics.window_error[finished], simulated.metrics.peak_torque[finished]
