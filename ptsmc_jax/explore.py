@@ -5,8 +5,8 @@ The pure function of JAX underneath is `rollout.simulate`.
 
 import html
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -30,20 +30,12 @@ from ptsmc_jax.simulation.requirements import Verdict
 from ptsmc_jax.theory.lower_bound import LowerBound
 
 
-class Quantities(Mapping[str, float]):
+class Quantities(dict[str, float]):
     """Numbers by name. Notebooks show them with units and meanings."""
 
     def __init__(self, values: Mapping[str, float], catalogue: Mapping[str, catalogues.Entry]):
-        self._values, self._catalogue = dict(values), catalogue
-
-    def __getitem__(self, name: str) -> float:
-        return self._values[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._values)
-
-    def __len__(self) -> int:
-        return len(self._values)
+        super().__init__(values)
+        self._catalogue = catalogue
 
     def __repr__(self) -> str:
         return "\n".join(f"{name:24s} {value:12.5g} {self._catalogue[name].unit}" for name, value in self.items())
@@ -364,7 +356,7 @@ def identify(
     logs = [telemetry.measurements(loaded, frame, f"log {k + 1}") for k, frame in enumerate(frames)]
     used = len(logs) - len(validate)
     estimated = estimation.estimate_parameters(loaded, logs[:used], logs[used:], free, report)
-    return Identified(**{field.name: getattr(estimated, field.name) for field in fields(estimated)})
+    return Identified(**vars(estimated))
 
 
 def units(kind: str = "spacecraft") -> dict[str, str]:
