@@ -14,7 +14,7 @@ from ptsmc_jax.dispersions.quantities import CATEGORIES
 from ptsmc_jax.numerics import statistics
 from tests.output import examples
 from tuning.output import campaign_report
-from tuning.studies import campaign_folder, campaign_summary, reasons
+from tuning.studies import campaign_folder, campaign_summary
 
 
 class Rows:
@@ -40,7 +40,8 @@ def test_inputs_of_the_worst_trial_have_percentile_median_and_sensitivity(monkey
     })  # fmt: skip
     monkeypatch.setattr(campaign_summary.rows, "column_names", lambda part: list(table.schema))
     monkeypatch.setattr(campaign_summary.rows, "read", lambda parts, names: table.select(names))
-    why: Any = inspect.unwrap(reasons.explain_worst_trials)  # without the type check, which would refuse `Rows`
+    # without the type check, which would refuse `Rows`
+    why: Any = inspect.unwrap(campaign_summary.explain_worst_trials)
     told = why(Rows(), ["peak_torque"], 1)
     assert [one["input"] for one in told] == ["initial_angle", "initial_w1"]  # q4 duplicates the angle
     assert told[0] == {"metric": "peak_torque", "trial": 400, "value": 4.0, "input": "initial_angle", "drawn": 2.0,

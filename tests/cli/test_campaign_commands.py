@@ -94,26 +94,20 @@ def test_montecarlo_writes_rows_summary_and_figures(command, tmp_path, monkeypat
                                                      [(r"\[0.5, 0.1\]", "[0, 0]")]))  # fmt: skip
 def test_equal_trials_are_reported(command, tmp_path, simulated, drawn, instead):
     """The scenario has no dispersion, or one of zero width, which compiled programs of other tests can simulate."""
-    assert not [said for said in summary(simulated)["warnings"] if "are equal: neither" in said]
+    assert not [said for said in summary(simulated)["warnings"] if "the same metrics: neither" in said]
     text = re.sub(drawn, instead, SHORT_CHAIN).replace("[2e-5, 1e-5]", "[0, 0]")
     (tmp_path / "same.toml").write_text(text)
     _, said, _ = command("montecarlo", "same.toml", "--trials", 250, "--no-figures")
-    assert "WARNING: all 250 trials are equal: neither" in said
+    assert "WARNING: all 250 trials have the same metrics: neither" in said
 
 
 def test_failed_trials_are_not_reported_as_equal():
     assert campaign_summary._equal_trials({"window_error": {"without_value": 5}}, 5) == []
     at_rest = {"window_error": {"without_value": 0, "mean": 0.0, "max": 0.0}}
-    (said,) = campaign_summary._equal_trials(
-        at_rest, 5, inputs_differ=True
-    )  # such as a dispersed inertia of a body at rest
-    assert said == "all 5 trials have the same metrics: the dispersions change no metric"
+    (said,) = campaign_summary._equal_trials(at_rest, 5)
+    assert said.startswith("all 5 trials have the same metrics: neither [dispersion] nor")
     at_rest["window_error"]["without_value"] = 4  # only one trial has a value
-    assert (
-        campaign_summary._equal_trials(at_rest, 5, inputs_differ=True)
-        == campaign_summary._equal_trials(at_rest, 5)
-        == []
-    )
+    assert campaign_summary._equal_trials(at_rest, 5) == []
 
 
 def test_more_trials_extend_an_existing_campaign(command, simulated, tmp_path):

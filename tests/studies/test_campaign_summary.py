@@ -54,21 +54,21 @@ def test_mixed_requirement_averages_time_fractions_and_counts_a_missing_one_as_z
 
 
 def test_failed_trial_counts_as_zero_in_quantiles_of_a_time_fraction():
-    told = campaign_summary._larger_is_better_statistics(
-        np.array([0.9, np.nan, 0.5, 0.8]), np.array([True, False, True, True])
+    told = campaign_summary._metric_statistics(
+        np.array([0.9, np.nan, 0.5, 0.8]), np.array([True, False, True, True]), True
     )
     assert (told["min"], told["max"], told["without_value"]) == (0.0, 0.9, 1)
     assert (told["0.0027"]["value"], told["0.1"]["value"], told["0.5"]["value"]) == (0.0, 0.0, 0.8)
     fractions, ended = np.linspace(0.0, 1.0, 200), np.arange(200) % 50 > 0
     told, mirrored = (
-        campaign_summary._larger_is_better_statistics(fractions, ended),
-        campaign_summary._metric_statistics(1.0 - fractions, ended),
+        campaign_summary._metric_statistics(fractions, ended, True),
+        campaign_summary._metric_statistics(1.0 - fractions, ended, False),
     )
     assert told["0.1"]["value"] == pytest.approx(1.0 - mirrored["0.9"]["value"])
     assert told["0.1"]["low"] == pytest.approx(1.0 - mirrored["0.9"]["high"])
     assert told["0.1"]["high"] == pytest.approx(1.0 - mirrored["0.9"]["low"])
     assert told["0.1"]["low"] < told["0.1"]["value"] < told["0.1"]["high"]
-    none = campaign_summary._larger_is_better_statistics(np.array([np.nan]), np.array([False]))
+    none = campaign_summary._metric_statistics(np.array([np.nan]), np.array([False]), True)
     assert none["0.5"]["value"] == 0.0
 
 
@@ -101,4 +101,4 @@ def test_bound_and_margins_use_the_first_trials_and_are_computed_once(tmp_path, 
     assert json.loads((tmp_path / "theory.json").read_text()) == {"lower_bound": 1e-6, "margins": []}
     campaign_theory.write_missing(folder)
     assert len(asked) == 2
-    assert campaign_theory.read_lower_bound(folder) == 1e-6
+    assert campaign_theory.read(folder)["lower_bound"] == 1e-6

@@ -253,7 +253,7 @@ def worst(
     from ptsmc_jax import scenario as scenarios
     from ptsmc_jax.campaigns import store
     from tuning.output import campaign_report
-    from tuning.studies import campaign_folder, campaign_summary, reasons
+    from tuning.studies import campaign_folder, campaign_summary
 
     campaign = campaign_folder.open_folder(folder)
     frame = campaign_summary.worst_trials(campaign, by, n)
@@ -261,7 +261,7 @@ def worst(
     inputs = []
     if why:
         required = [requirement.metric for requirement in scenarios.requirements(campaign.scenario)]
-        inputs = reasons.explain_worst_trials(campaign, list(dict.fromkeys((by, *required))), n)
+        inputs = campaign_summary.explain_worst_trials(campaign, list(dict.fromkeys((by, *required))), n)
         store.write_csv(folder / "why.csv", list(inputs[0]) if inputs else [], [list(row.values()) for row in inputs])
     if not quiet:
         plant = campaign.scenario.plant.kind

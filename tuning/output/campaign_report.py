@@ -267,7 +267,7 @@ def explanation_lines(inputs: list[dict[str, Any]], plant: str) -> Iterator[str]
     If the trial failed, or too few trials show an influence, the inputs farthest from their medians are named.
 
     Args:
-        inputs: rows of `reasons.explain_worst_trials`.
+        inputs: rows of `campaign_summary.explain_worst_trials`.
         plant: kind of the plant.
     """
     for (metric, trial), group in itertools.groupby(inputs, lambda row: (row["metric"], row["trial"])):

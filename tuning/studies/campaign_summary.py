@@ -3,7 +3,7 @@
 All of them are computed from the rows of the campaign. Read `summarise` first.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,8 +21,8 @@ from ptsmc_jax.scenario import parsing, plausibility
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.requirements import Requirement, Verdict, must_keep
 from ptsmc_jax.simulation.rollout import STATUS
+from tuning.studies import campaign_theory
 from tuning.studies.campaign_folder import Folder, open_folder
-from tuning.studies.campaign_theory import margins_without_verdict, read_lower_bound, read_margin_verdicts
 
 TOLERANCE = 1e-12  # largest relative difference of equal results
 CONFIDENCE = 0.95  # confidence level of the intervals, unless a requirement has its own
@@ -123,8 +123,9 @@ def _verdict_entry(verdict: Verdict, requirement: Requirement, beyond: np.ndarra
 def summarise(folder: Folder) -> dict[str, Any]:
     """Return the content of `summary.json`."""
     parts = folder.intact_parts()
-    verdicts = [*judge_requirements(folder), *read_margin_verdicts(folder)]
-    missing_margins = margins_without_verdict(folder)
+    theory = campaign_theory.read(folder)
+    verdicts = [*judge_requirements(folder), *theory.get("margins", [])]
+    missing_margins = campaign_theory.margins_without_verdict(folder, theory)
     frame = rows.read(parts, ["status", "reason", "bad_time"]).head(folder.trials)
     counts = {status: int((frame["status"] == status).sum()) for status in dict.fromkeys(s for s, _ in STATUS.values())}
     finished, failed = running.has_finished(frame), frame.filter(pl.col("status") != "ok")
@@ -138,9 +139,7 @@ def summarise(folder: Folder) -> dict[str, Any]:
     inputs = rows.read(parts, input_names).head(min(DRIVER_TRIALS, folder.trials))
     for name in (*scenario.catalogue(folder.scenario), *folder.custom_metric_names):
         values = rows.read(parts, [name]).head(folder.trials)[name].to_numpy().astype(float)
-        quantiles[name] = (_larger_is_better_statistics if name in catalogues.LARGER_IS_BETTER else _metric_statistics)(
-            values, finished
-        )
+        quantiles[name] = _metric_statistics(values, finished, name in catalogues.LARGER_IS_BETTER)
         has_value = np.isfinite(values[:DRIVER_TRIALS]) & finished[:DRIVER_TRIALS]
         driver_trials[name] = int(has_value.sum())
         known_inputs = {key: inputs[key].to_numpy()[has_value] for key in input_names}
@@ -150,7 +149,6 @@ def summarise(folder: Folder) -> dict[str, Any]:
             known_values = values[:DRIVER_TRIALS][has_value]
             drivers[name] = statistics.drivers(known_inputs, known_values, cached_ranks, CATEGORIES)
     simulated = int(frame.height)
-    inputs_differ = any(statistics.has_variation(inputs[key].to_numpy().astype(float)) for key in input_names)
     met = all(v["met"] for v in verdicts) if verdicts else counts["ok"] == simulated
     return {
         "status": "incomplete" if simulated < folder.trials or missing_margins else "met" if met else "not met",
@@ -163,7 +161,7 @@ def summarise(folder: Folder) -> dict[str, Any]:
         "counts": counts,
         "reasons": reasons,
         "interval_confidence": CONFIDENCE,
-        "lower_bound": read_lower_bound(folder),
+        "lower_bound": theory.get("lower_bound"),
         "verdicts": verdicts,
         **_pointing_budget(folder, parts, finished),
         "quantiles": quantiles,
@@ -173,7 +171,7 @@ def summarise(folder: Folder) -> dict[str, Any]:
         "warnings": [
             *plausibility.warnings(folder.scenario),
             *filter(None, [folder.parameter_differences]),
-            *_equal_trials(quantiles, simulated, inputs_differ=inputs_differ),
+            *_equal_trials(quantiles, simulated),
         ],
     }
 
@@ -210,19 +208,14 @@ def input_columns(folder: Folder, parts: list[rows.Part]) -> list[str]:
     return [name for name in rows.column_names(parts[0]) if name not in others]
 
 
-def _equal_trials(quantiles: dict[str, Any], trials: int, *, inputs_differ: bool = False) -> list[str]:
-    """Return a warning if all trials have the same metrics; inputs_differ: whether the inputs of the trials differ."""
+def _equal_trials(quantiles: dict[str, Any], trials: int) -> list[str]:
+    """Return a warning if all trials have the same metrics."""
     measured = [metric for metric in quantiles.values() if "max" in metric]
     differ = any(abs(m["max"] - m["mean"]) > TOLERANCE * abs(m["max"]) for m in measured)
-    if trials < 2 or not measured or differ:
+    if trials < 2 or not measured or differ or any(m["without_value"] for m in measured):  # failed trials differ too
         return []
-    if any(m["without_value"] for m in measured):  # failed trials differ from the other trials
-        return []
-    if inputs_differ:  # such as a dispersed inertia of a body that stays at rest
-        return [f"all {trials} trials have the same metrics: the dispersions change no metric"]
-    return [
-        f"all {trials} trials are equal: neither [dispersion] nor the noise of [hardware] differs; one trial is enough"
-    ]
+    reason = "neither [dispersion] nor the noise of [hardware] changes them"
+    return [f"all {trials} trials have the same metrics: {reason}; one trial is enough"]
 
 
 def _pointing_budget(folder: Folder, parts: list[rows.Part], finished: np.ndarray) -> dict[str, Any]:
@@ -248,43 +241,28 @@ def _pointing_budget(folder: Folder, parts: list[rows.Part], finished: np.ndarra
     return {"pointing": {**observed, "probability": BUDGET_FRACTION, "confidence": CONFIDENCE, "budget": budget}}
 
 
-def _metric_statistics(values: np.ndarray, finished: np.ndarray) -> dict[str, Any]:
+def _metric_statistics(values: np.ndarray, finished: np.ndarray, larger_is_better: bool) -> dict[str, Any]:
     """Return statistics of a metric: mean, RMS and maximum of the trials with a value, and quantiles of all trials.
 
-    Quantiles count a trial without a value as infinite.
+    Quantiles count a trial without a value as infinite. If larger values are better, it counts as 0, the quantiles are
+    low ones, and the minimum is included. Key "0.0027" then has the value that 99.73 % of the trials reach.
     """
     has_value = finished & np.isfinite(values)
-    sorted_values = np.sort(np.where(has_value, values, np.inf))
-    return _known_statistics(values, has_value) | {str(q): _quantile_entry(sorted_values, q) for q in QUANTILES}
-
-
-def _larger_is_better_statistics(values: np.ndarray, finished: np.ndarray) -> dict[str, Any]:
-    """Return statistics of a metric that is better when larger: `_metric_statistics`, the minimum, low quantiles.
-
-    Quantiles count a trial without a value as 0. Key "0.0027" has the value that 99.73 % of the trials reach.
-    """
-    has_value = finished & np.isfinite(values)
-    sorted_values = np.sort(-np.where(has_value, values, 0.0))  # sorted, the best value first
-    entry = _known_statistics(values, has_value) | {"min": -sorted_values[-1]}
-    for quantile in QUANTILES:
-        interval = _quantile_entry(sorted_values, quantile)
-        entry[f"{1.0 - quantile:g}"] = {"value": -interval["value"], "low": -interval["high"], "high": -interval["low"]}
-    return entry
-
-
-def _known_statistics(values: np.ndarray, has_value: np.ndarray) -> dict[str, Any]:
-    """Return statistics of the trials with a value."""
     known_values = values[has_value]
     entry: dict[str, Any] = {"without_value": int(values.size - known_values.size)}
     if known_values.size:
         entry |= {"mean": known_values.mean(), "rms": np.sqrt(np.mean(known_values**2)), "max": known_values.max()}
+    best_first = np.sort(-np.where(has_value, values, 0.0) if larger_is_better else np.where(has_value, values, np.inf))
+    if larger_is_better:
+        entry["min"] = -best_first[-1]
+    for quantile in QUANTILES:
+        value = statistics.sample_quantile(best_first, quantile)
+        low, high = statistics.quantile_interval(best_first, quantile, CONFIDENCE)
+        if larger_is_better:
+            entry[f"{1.0 - quantile:g}"] = {"value": -value, "low": -high, "high": -low}
+        else:
+            entry[str(quantile)] = {"value": value, "low": low, "high": high}
     return entry
-
-
-def _quantile_entry(sorted_values: np.ndarray, quantile: float) -> dict[str, float]:
-    """Return a quantile and its confidence interval."""
-    low, high = statistics.quantile_interval(sorted_values, quantile, CONFIDENCE)
-    return {"value": statistics.sample_quantile(sorted_values, quantile), "low": low, "high": high}
 
 
 def write_summary(folder: Folder, summary: dict[str, Any], figures: bool) -> None:
@@ -345,6 +323,62 @@ def most_extreme(metric: str, values: np.ndarray, failed: np.ndarray, count: int
     # SAMPLES[0] counts samples without an error
     larger_is_better = metric in (*catalogues.LARGER_IS_BETTER, run_tables.SAMPLES[0])
     return statistics.most_extreme(values, failed, count, larger_is_better=larger_is_better)
+
+
+def explain_worst_trials(folder: Folder, metrics: Sequence[str], count: int) -> list[dict[str, Any]]:
+    """Return the inputs of the worst trials by each metric, compared with the inputs of all trials.
+
+    Failed trials come first, as in `worst_trials`. If several inputs order the trials equally, only the first of them
+    is listed.
+
+    Args:
+        folder: the campaign.
+        metrics: names of metrics.
+        count: number of worst trials for each metric.
+
+    Returns:
+        An entry for each metric, trial and input. It has the percentile rank of the input [%] and the median of all
+        trials. A categorical input, such as the number of a failed wheel, has the fraction of equal trials instead.
+        "rank_correlation" and "first_order" are the sensitivities of the metric, see `statistics.drivers`. They are
+        None if too few trials have a value. "trials" is the number of trials with a value.
+    """
+    parts, unit_of = folder.intact_parts(), folder.units
+    input_names = input_columns(folder, parts)
+    frame = rows.read(parts, ["trial", "status", *dict.fromkeys((*metrics, *input_names))]).head(folder.trials)
+    inputs = {name: frame[name].to_numpy().astype(float) for name in input_names}
+    varied = {name: values for name, values in inputs.items() if statistics.has_variation(values)}
+    distinct = statistics.distinct_inputs({name: values for name, values in varied.items() if name not in CATEGORIES})
+    names = [name for name in varied if name in distinct or name in CATEGORIES]
+    failed = ~running.has_finished(frame)
+    entries: list[dict[str, Any]] = []
+    for metric in metrics:
+        values = frame[metric].fill_null(float("nan")).to_numpy()
+        has_value = np.isfinite(values) & ~failed
+        known_inputs = {name: inputs[name][has_value] for name in names}
+        drivers = statistics.drivers(known_inputs, values[has_value], categories=CATEGORIES) if has_value.any() else {}
+        for index in most_extreme(metric, values, failed, count):
+            entries += [
+                {
+                    "metric": metric,
+                    "trial": int(frame["trial"][int(index)]),
+                    "value": float(values[index]) if np.isfinite(values[index]) else None,
+                    "input": name,
+                    "drawn": float(inputs[name][index]),
+                    "unit": unit_of.get(name, ""),
+                    **_rank_input(name, inputs[name], float(inputs[name][index])),
+                    **drivers.get(name, {"rank_correlation": None, "first_order": None}),
+                    "trials": int(has_value.sum()),
+                }
+                for name in names
+            ]
+    return entries
+
+
+def _rank_input(name: str, values: np.ndarray, value: float) -> dict[str, float | None]:
+    """Return the percentile rank of an input among all trials, or the fraction of equal trials for a category."""
+    if name in CATEGORIES:
+        return {"percentile": None, "median": None, "fraction": float(np.mean(values == value))}
+    return {"percentile": statistics.percentile(values, value), "median": float(np.median(values)), "fraction": None}
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ this file.
 """
 
 import json
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -38,7 +39,8 @@ def prepare(folder: Folder) -> None:
 
 
 def _lacks_theory(folder: Folder) -> bool:
-    return "lower_bound" not in _read_theory(folder) or bool(margins_without_verdict(folder))
+    theory = read(folder)
+    return "lower_bound" not in theory or bool(margins_without_verdict(folder, theory))
 
 
 def _rows_with_margins(folder: Folder) -> np.ndarray | Row | None:
@@ -47,23 +49,14 @@ def _rows_with_margins(folder: Folder) -> np.ndarray | Row | None:
     return None if table is None else table.rows(np.arange(min(margin_verdicts.TRIALS, table.count)), folder.seed)
 
 
-def read_lower_bound(folder: Folder) -> float | None:
-    """Return the lower bound of the RMS window error that `write_missing` wrote; None: there is none."""
-    return _read_theory(folder).get("lower_bound")
-
-
-def read_margin_verdicts(folder: Folder) -> list[dict[str, Any]]:
-    """Return the verdicts on margins that `write_missing` wrote, as in `summary.json`."""
-    return _read_theory(folder).get("margins", [])
-
-
-def margins_without_verdict(folder: Folder) -> list[str]:
+def margins_without_verdict(folder: Folder, theory: Mapping[str, Any]) -> list[str]:
     """Return the required margins without a verdict: the campaign was interrupted, or `theory.json` is damaged."""
-    judged = {verdict["metric"] for verdict in read_margin_verdicts(folder)}
+    judged = {verdict["metric"] for verdict in theory.get("margins", [])}
     return [name for name in catalogues.MARGINS if name in folder.scenario.requirements and name not in judged]
 
 
-def _read_theory(folder: Folder) -> dict[str, Any]:
+def read(folder: Folder) -> dict[str, Any]:
+    """Return the content of `theory.json`: "lower_bound" and "margins". It is empty if the file cannot be read."""
     try:
         return dict(json.loads((folder.path / THEORY).read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError):
