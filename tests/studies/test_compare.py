@@ -22,7 +22,7 @@ from ptsmc_jax.simulation.metrics import Metrics
 from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import ROOT, SHORT, refused
 from tests.output.pages import checked
-from tuning.cli import options
+from tuning.cli import main
 from tuning.errors import UsageError
 from tuning.output import compare_report, page, summaries
 from tuning.output.formats import format_ratio
@@ -60,7 +60,8 @@ def test_all_laws_have_the_same_mission_requirements_and_search_settings(monkeyp
 
 
 def test_help_of_option_against_lists_every_law():
-    said = typing.get_args(options.Against)[1].help.split(": ")[1].split(";")[0]
+    _, option = typing.get_args(typing.get_type_hints(main.compare, include_extras=True)["against"])
+    said = option.help.split(": ")[1].split(";")[0]
     assert said.split(", ") == compare.law_kinds()[1:]
 
 
