@@ -25,7 +25,7 @@ def with_margins(monkeypatch, simulated, of_loop, objective):
     some: Any = SimpleNamespace(margins=object(), objective=objective)
     evaluator, at = Evaluator(Bounds(("eta", "delta"), (2.0, 0.1), (3.0, 1.0))), np.array([[0.0, 0.0], [1.0, 1.0]])
     rest = {"gains": at, "f": np.zeros(2), "value": np.zeros(2), "f_gradient": np.zeros((2, 2))}
-    return MeasurementWithGradients(**evaluator._evaluate(lambda problem, at: {**rest, **simulated}, some, at))
+    return MeasurementWithGradients(**evaluator._add_margins({**rest, **simulated}, some, at))
 
 
 @pytest.mark.parametrize(("trials", "loops"), [(2, 5), (5, 2)])

@@ -42,12 +42,6 @@ class Measurement:
         """Largest c over the completed trials, (points,). It is -1 without requirements."""
         return ignore_failures(self.c).max(axis=(1, 2), initial=-1.0)
 
-    @property
-    def nearest(self) -> np.ndarray:
-        """Index of the row with the largest c over the completed trials, (points,). It is 0 without requirements."""
-        largest = ignore_failures(self.c).max(axis=2, initial=-1.0)
-        return largest.argmax(axis=1) if largest.shape[1] else np.zeros(len(largest), int)
-
     def at(self: M, point: int) -> M:
         """Return the measurement at one of the points."""
         return replace(self, **{f.name: getattr(self, f.name)[point : point + 1] for f in fields(self)})
@@ -81,27 +75,44 @@ class Evaluator:
     def measure(self, problem: Problem, normalised: np.ndarray) -> Measurement:
         """Return F, constraints and objective at points, (points, gains) normalised gains."""
         self.rollouts += len(normalised) * problem.trials.size
-        request = _encode_request(b"values", problem, normalised)
-        return Measurement(
-            **self._journal.get(request, lambda: self._evaluate(self._simulate_and_judge, problem, normalised))
-        )
+        return Measurement(**self._answer(problem, normalised, with_gradients=False))
 
     def measure_with_gradients(self, problem: Problem, normalised: np.ndarray) -> MeasurementWithGradients:
         """Return F, constraints and objective with gradients at points, (points, gains) normalised gains."""
         self.gradients += len(normalised) * problem.trials.size
-        request = _encode_request(b"gradients", problem, normalised)
-        return MeasurementWithGradients(
-            **self._journal.get(
-                request, lambda: self._evaluate(self._simulate_and_judge_with_gradients, problem, normalised)
-            )
-        )
+        return MeasurementWithGradients(**self._answer(problem, normalised, with_gradients=True))
 
-    def _evaluate(
-        self, compute: Callable[[Problem, np.ndarray], dict[str, np.ndarray]], problem: Problem, normalised: np.ndarray
+    def _answer(self, problem: Problem, normalised: np.ndarray, *, with_gradients: bool) -> dict[str, np.ndarray]:
+        """Return the fields of a measurement by name, from the journal or from new simulations."""
+
+        def compute() -> dict[str, np.ndarray]:
+            values = self._simulate_and_judge(problem, normalised, with_gradients)
+            return values if problem.margins is None else self._add_margins(values, problem, normalised)
+
+        kind = b"gradients" if with_gradients else b"values"
+        return self._journal.get(_encode_request(kind, problem, normalised), compute)
+
+    def _simulate_and_judge(
+        self, problem: Problem, normalised: np.ndarray, with_gradients: bool
     ) -> dict[str, np.ndarray]:
-        values = compute(problem, normalised)
-        if problem.margins is None:
-            return values
+        """Return the fields of a measurement by name, without the rows of the margins."""
+        scaled = _apply_in_calls(partial(_gains_with_derivatives, scale=self.bounds.scale), normalised)
+        gains, directions, metrics = scaled["gains"], scaled["along"], needed_metrics(problem)
+        if with_gradients:
+            differentiated = simulations.simulate_with_derivatives(problem.batch, gains, directions, metrics)
+            judged = _apply_in_calls(partial(_judge_gradients, problem.rules), gains, directions, *differentiated)
+        else:
+            simulated = simulations.simulate(problem.batch, gains)
+            values_by_trial = np.stack([getattr(simulated.metrics, name) for name in metrics], axis=-1)
+            status = np.asarray(simulated.status)
+            judged = _apply_in_calls(partial(_judge_points, problem.rules), gains, values_by_trial, status)
+        return {"gains": gains, **judged}
+
+    def _add_margins(
+        self, values: dict[str, np.ndarray], problem: Problem, normalised: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """Append the rows of the margins to the fields of a measurement."""
+        assert problem.margins is not None
         # margins always come with gradients: the compilation of a second program would take longer than it saves
         of_margins = margin_rows.constraints_at_points(problem.margins, self.bounds.scale, normalised)
         longest = max(values["c"].shape[2], of_margins["c"].shape[2])
@@ -113,39 +124,14 @@ class Evaluator:
         for name, fill in (("c", -1.0), ("c_gradient", 0.0)):
             if name in values:
                 values[name] = np.concatenate([pad(values[name], fill), pad(of_margins[name], fill)], axis=1)
-        return _set_f_to_largest_ratio(values) if problem.objective == LIMITS else values
-
-    def _simulate_and_judge(self, problem: Problem, normalised: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the fields of `Measurement` by name, without the rows of the margins."""
-        gains = self._scale_gains(normalised)[0]
-        values = simulations.simulate(problem.batch, gains)
-        metrics = np.stack([getattr(values.metrics, name) for name in needed_metrics(problem)], axis=-1)
-        return {
-            "gains": gains,
-            **_apply_in_calls(partial(_judge_points, problem.rules), gains, metrics, np.asarray(values.status)),
-        }
-
-    def _simulate_and_judge_with_gradients(self, problem: Problem, normalised: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the fields of `MeasurementWithGradients` by name, without the rows of the margins."""
-        gains, directions = self._scale_gains(normalised)
-        values = simulations.simulate_with_derivatives(problem.batch, gains, directions, needed_metrics(problem))
-        return {"gains": gains, **_apply_in_calls(partial(_judge_gradients, problem.rules), gains, directions, *values)}
-
-    def _scale_gains(self, normalised: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the gains, (points, gains), and their derivatives by the normalised gains, (points, gains, gains)."""
-        gains = _apply_in_calls(partial(_gains_with_derivatives, scale=self.bounds.scale), normalised)
-        return gains["gains"], gains["along"]
-
-
-def _set_f_to_largest_ratio(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Set F to ln of the largest metric / limit, including the rows of the margins, and update its gradient."""
-    c = ignore_failures(values["c"]).reshape(len(values["c"]), -1)
-    nearest, points = c.argmax(axis=1), np.arange(len(c))
-    largest = np.maximum(1.0 + c[points, nearest], LEAST)
-    values["f"] = values["value"] = np.log(largest)
-    if "c_gradient" in values:
-        values["f_gradient"] = values["c_gradient"].reshape(*c.shape, -1)[points, nearest] / largest[:, None]
-    return values
+        if problem.objective == LIMITS:  # F is ln of the largest metric / limit, including the rows of the margins
+            c = ignore_failures(values["c"]).reshape(len(values["c"]), -1)
+            nearest, points = c.argmax(axis=1), np.arange(len(c))
+            largest = np.maximum(1.0 + c[points, nearest], LEAST)
+            values["f"] = values["value"] = np.log(largest)
+            if "c_gradient" in values:
+                values["f_gradient"] = values["c_gradient"].reshape(*c.shape, -1)[points, nearest] / largest[:, None]
+        return values
 
 
 def _apply_in_calls(program: Callable[..., dict[str, jax.Array]], *arrays: np.ndarray) -> dict[str, np.ndarray]:
