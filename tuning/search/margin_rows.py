@@ -180,25 +180,18 @@ def constraints_with_derivatives(
     def differentiable_runs(normalised: Array) -> tuple[Any, Any]:
         runs = nominal_runs(asked, scale.gains(normalised))
         return tuple(
-            jax.tree.map(lambda v, kept=kept: v if _is_differentiable(v) is kept else None, runs)
+            jax.tree.map(lambda v, kept=kept: v if jnp.issubdtype(v.dtype, jnp.inexact) == kept else None, runs)
             for kept in (True, False)
         )
 
     def judge_runs(normalised: Array, inexact: Any) -> Array:
-        def merge(one: Any, other: Any) -> Any:
-            return other if one is None else one
-
-        runs = jax.tree.map(merge, inexact, constant, is_leaf=lambda v: v is None)
+        runs = jax.tree.map(lambda a, b: b if a is None else a, inexact, constant, is_leaf=lambda v: v is None)
         return margin_constraints(asked, scale.gains(normalised), runs)
 
     axes = jnp.eye(normalised.size)
     each = lanes.vmap(lambda axis: jax.jvp(differentiable_runs, (normalised,), (axis,), has_aux=True))(axes)
     (inexact, constant), derivatives = jax.tree.map(lambda v: v[0], (each[0], each[2])), each[1]
     return jax.vmap(lambda *by: jax.jvp(judge_runs, (normalised, inexact), by), out_axes=(None, -1))(axes, derivatives)
-
-
-def _is_differentiable(leaf: Any) -> bool:
-    return bool(jnp.issubdtype(leaf.dtype, jnp.inexact))
 
 
 def constraints_at_points(
