@@ -82,7 +82,8 @@ class SampleTimes:
             return self.wait, jnp.zeros_like(jnp.asarray(age, float))
         whole = self.wait
         if self.split:
-            whole = jnp.where(age >= (self.wait + 1) * self.period - self._rounding, self.wait + 1, self.wait)
+            limit = (self.wait + 1) * self.period - guards.time_tolerance(self.period, self.period)
+            whole = jnp.where(age >= limit, self.wait + 1, self.wait)
         return whole, jnp.clip(age - whole * self.period, 0.0, self.period)
 
     def at_control_samples(self) -> "SampleTimes":
@@ -90,10 +91,6 @@ class SampleTimes:
         if self.every is not None:
             return self
         return replace(self, interval=self.period, every=1, wait=self.longest_wait, split=False, pattern=(1, 1))
-
-    @property
-    def _rounding(self) -> Any:
-        return guards.time_tolerance(self.period, self.period)
 
     def _time(self, sample: Any) -> Any:
         return jnp.asarray(sample, float) * self.period

@@ -27,16 +27,13 @@ def rk4(rate: Callable[[Scalar, Any], Any], t: Scalar, y: Any, dt: Scalar, *, ro
         dt: length of the step [s].
         rolled: use a loop over the stages, so that a large `rate` is compiled once instead of four times.
     """
-    if rolled:
-        return _rolled_rk4(rate, t, y, dt)
-    k1 = rate(t, y)
-    k2 = rate(t + dt / 2, _add_scaled(y, k1, dt / 2))
-    k3 = rate(t + dt / 2, _add_scaled(y, k2, dt / 2))
-    k4 = rate(t + dt, _add_scaled(y, k3, dt))
-    return _simpson(y, dt, k1, k2, k3, k4)
+    if not rolled:
+        k1 = rate(t, y)
+        k2 = rate(t + dt / 2, _add_scaled(y, k1, dt / 2))
+        k3 = rate(t + dt / 2, _add_scaled(y, k2, dt / 2))
+        k4 = rate(t + dt, _add_scaled(y, k3, dt))
+        return _simpson(y, dt, k1, k2, k3, k4)
 
-
-def _rolled_rk4(rate: Callable[[Scalar, Any], Any], t: Scalar, y: Any, dt: Scalar) -> Any:
     def stage(k: Array | int, previous_and_total: tuple[Any, Any]) -> tuple[Any, Any]:
         """Return the rate of stage k, and the weighted sum of the rates of the stages 0 to k."""
         previous, total = previous_and_total

@@ -87,15 +87,6 @@ class FlexibleSpacecraft(Spacecraft):
         """Return the angular momentum in body axes, J w + D' e' [N m s]."""
         return self.inertia @ x.w + self.coupling.T @ x.modes.rate
 
-    def energy(self, x: AttitudeState) -> Scalar:
-        """Return the kinetic and elastic energy, (w'J w + 2 w'D'e' + |e'|^2 + |W e|^2) / 2 [J].
-
-        It cannot grow if u = d = 0.
-        """
-        e, rate = x.modes
-        kinetic = x.w @ self.inertia @ x.w + 2.0 * x.w @ (self.coupling.T @ rate) + rate @ rate
-        return (kinetic + jnp.sum((self.frequency * e) ** 2)) / 2.0
-
     def modal_amplitude(self, x: AttitudeState) -> Scalar:
         """Return the amplitude of the modes, the square root of the sum of e^2 + (e'/W)^2 [sqrt(kg) m]."""
         e, rate = x.modes

@@ -76,7 +76,10 @@ def simulate(
 
 def _simulate_sampled(run: Run, seed: WholeNumber, trial: WholeNumber, software: Software) -> Result:
     """Return the result of a sampled run: control periods one after the other, with metrics and history."""
-    ticks = _append_end_sample(run.ticks, run.criteria.t_end) if run.record else run.ticks
+    ticks, t_end = run.ticks, run.criteria.t_end
+    if run.record:  # the history ends with a sample at t_end, whose period has no length and changes no metric
+        end = Ticks(t_end, t_end, jnp.asarray(True), ticks.sample[-1] + 1, jnp.ones_like(t_end), jnp.asarray(False))
+        ticks = jax.tree.map(lambda column, value: jnp.append(column, value.astype(column.dtype)), ticks, end)
     vehicle, state = start(run.parts, ticks, run.x0, seed, trial, software)
 
     def step(carry: tuple[State, Score], tick: Tick) -> tuple[tuple[State, Score], Log | None]:
@@ -105,12 +108,6 @@ def _last_row(run: Run, state: State, rows: Log) -> Log:
     last = run_state.history_row_at(run, t, x, decision, torque, jnp.asarray(True), state.walk, wheels)
     readings, sent = jax.tree.map(lambda column: column[end_index], (rows.readings, rows.sent))
     return last._replace(readings=readings, sent=sent)
-
-
-def _append_end_sample(ticks: Ticks, t_end: Scalar) -> Ticks:
-    """Append a sample at t_end, whose period has no length and changes no metric."""
-    end_sample = Ticks(t_end, t_end, jnp.asarray(True), ticks.sample[-1] + 1, jnp.ones_like(t_end), jnp.asarray(False))
-    return jax.tree.map(lambda column, value: jnp.append(column, value.astype(column.dtype)), ticks, end_sample)
 
 
 def _simulate_continuous(run: Run) -> Result:
