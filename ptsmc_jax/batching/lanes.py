@@ -35,7 +35,7 @@ class LanesWarning(UserWarning):
     """A primitive without a rule was evaluated by `jax.vmap`, or a kernel became a scan: correct, but slower."""
 
 
-def vmap(function: Callable, in_axes: Any = 0, *, strict: bool = False, kernel: bool = False) -> Callable:
+def vmap(function: Callable, in_axes: Any = 0, *, kernel: bool = False) -> Callable:
     """Vectorise a function over trials, like `jax.vmap(function, in_axes)`, in structure-of-arrays form.
 
     The result composes with jit, vmap, jvp and grad from outside.
@@ -43,7 +43,6 @@ def vmap(function: Callable, in_axes: Any = 0, *, strict: bool = False, kernel: 
     Args:
         function: a function of arrays in pytrees.
         in_axes: 0, None or a tuple of pytree prefixes of these, one for each argument.
-        strict: refuse primitives without a rule. Otherwise `jax.vmap` evaluates them, with a `LanesWarning`.
         kernel: run long loops as one kernel of an accelerator where possible, see `kernel`. Such a loop has no
             derivative from outside.
 
@@ -52,7 +51,6 @@ def vmap(function: Callable, in_axes: Any = 0, *, strict: bool = False, kernel: 
 
     Raises:
         ValueError: No argument is mapped, or the numbers of trials differ.
-        NotImplementedError: strict, and a primitive has no rule.
 
     >>> crosses = vmap(lambda a: jnp.cross(a, jnp.array([0.0, 0.0, 1.0])))
     >>> crosses(jnp.array([[1.0, 0.0, 0.0], [0.0, 2.0, 0.0]])).tolist()
@@ -62,9 +60,7 @@ def vmap(function: Callable, in_axes: Any = 0, *, strict: bool = False, kernel: 
     def batched_function(*args: Any) -> Any:
         trials, one_trial, values = _batched_arguments(args, in_axes)
         closed, out = jax.make_jaxpr(function, return_shape=True)(*one_trial)
-        results = _Interpreter(trials, strict, use_kernel=kernel).evaluate(
-            dependence.eliminate_dead_code(closed), values
-        )
+        results = _Interpreter(trials, use_kernel=kernel).evaluate(dependence.eliminate_dead_code(closed), values)
         return jax.tree.unflatten(jax.tree.structure(out), [value.to_array((trials,)) for value in results])
 
     return batched_function
@@ -110,7 +106,7 @@ def jvp(function: Callable, in_axes: Any = 0, *, kernel: bool = False) -> Callab
         shapes = [v.aval.shape for v in closed.jaxpr.invars[len(values) :]]
         count = along[0].shape[0] if along[0].ndim else 0
         values += [_batch_directions(leaf, shape, count, trials) for leaf, shape in zip(along, shapes, strict=True)]
-        results = _Interpreter(trials, False, count, kernel).evaluate(dependence.eliminate_dead_code(closed), values)
+        results = _Interpreter(trials, count, kernel).evaluate(dependence.eliminate_dead_code(closed), values)
         half = len(results) // 2
         batches = [(trials,)] * half + [(count, trials)] * half
         return jax.tree.unflatten(jax.tree.structure(out), list(map(BatchedArray.to_array, results, batches)))
@@ -155,13 +151,12 @@ class _Interpreter:
 
     Args:
         trials: size of the batch.
-        strict: refuse primitives without a rule, as in `vmap`.
         directions: number of directions of tangents, 0 without tangents.
         use_kernel: run long scans as a kernel.
     """
 
-    def __init__(self, trials: int, strict: bool, directions: int = 0, use_kernel: bool = False):
-        self.trials, self.directions, self.strict, self.use_kernel = trials, directions, strict, use_kernel
+    def __init__(self, trials: int, directions: int = 0, use_kernel: bool = False):
+        self.trials, self.directions, self.use_kernel = trials, directions, use_kernel
         self.batch_shapes = ((), (trials,), (directions, 1), (directions, trials))  # batch shape by `BatchedArray.axes`
         self.rules = components.ComponentRules()
 
@@ -176,7 +171,7 @@ class _Interpreter:
 
         Arrays of the inner trace must not be stored in this interpreter.
         """
-        return _Interpreter(self.trials, self.strict, self.directions).evaluate(closed, arguments)
+        return _Interpreter(self.trials, self.directions).evaluate(closed, arguments)
 
     def apply(self, eqn: Any, values: list[BatchedArray]) -> list[BatchedArray]:
         """Return the results of one equation."""
@@ -197,8 +192,6 @@ class _Interpreter:
             return self.apply_to_arrays(eqn, values)
         if not components.has_rule(name):
             message = f"lanes have no rule for the primitive `{name}`{dependence.source_location(eqn)}"
-            if self.strict:
-                raise NotImplementedError(f"{message}; use other primitives, or strict=False")
             warnings.warn(f"{message}: jax.vmap evaluates it, which may be slow", LanesWarning, stacklevel=2)
         results = self.rules.apply(eqn, values)
         if results is None:

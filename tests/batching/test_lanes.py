@@ -48,8 +48,8 @@ def agree(got, expected):
         assert np.abs(a[finite] - b[finite]).max(initial=0.0) <= tolerance * scale
 
 
-def check(function, *args, in_axes: Any = 0, strict=False):
-    mapped = lanes.vmap(function, in_axes, strict=strict), jax.vmap(function, in_axes)
+def check(function, *args, in_axes: Any = 0):
+    mapped = lanes.vmap(function, in_axes), jax.vmap(function, in_axes)
     agree(*jax.jit(lambda *args: [one(*args) for one in mapped])(*args))  # one program compiles faster than two
 
 
@@ -410,7 +410,7 @@ def mapped(group):
         for name, (function, *_) in rows.items():
             has_rules = name not in WITHOUT_RULE
             with pytest.warns(lanes.LanesWarning, match="no rule") if not has_rules else nullcontext():
-                found[name] = [one(*args[name]) for one in (lanes.vmap(function, strict=has_rules), jax.vmap(function))]
+                found[name] = [one(*args[name]) for one in (lanes.vmap(function), jax.vmap(function))]
         return found
 
     return both({name: tuple(args) for name, (_, *args) in rows.items()})
@@ -418,7 +418,7 @@ def mapped(group):
 
 @pytest.mark.parametrize("name", CASES)
 def test_lanes_vmap_equals_jax_vmap(name):
-    """Functions with rules for all primitives are evaluated with strict=True."""
+    """Functions with rules for all primitives cause no warning, which pytest would raise as an error."""
     agree(*mapped(name.split(":")[0])[name])
 
 
@@ -520,7 +520,7 @@ def test_lanes_jvp_equals_jax_jvp(name, shared):
 
 
 @pytest.mark.parametrize("name", sorted(WITHOUT_RULE))
-def test_strict_lanes_refuse_primitives_without_a_rule(name):
+def test_lanes_warn_of_primitives_without_a_rule(name):
     function, *args = CASES[name]
-    with pytest.raises(NotImplementedError, match="lanes have no rule for the primitive `"):
-        jax.eval_shape(lanes.vmap(function, strict=True), *args)
+    with pytest.warns(lanes.LanesWarning, match="lanes have no rule for the primitive `"):
+        jax.eval_shape(lanes.vmap(function), *args)
