@@ -28,14 +28,6 @@ class Delivery(NamedTuple):
     weight: Scalar  # 1, or 0 for no reading; in a partial first period between them, see `KalmanFilter.correct`
 
 
-class Readings(NamedTuple):
-    """Readings of all sensors at a control sample."""
-
-    delivered: tuple[Delivery, ...]  # one for each attitude sensor
-    ages: tuple[Array, ...]  # ages of these readings [s]
-    rate: Array  # (3,) gyro sample [rad/s]
-
-
 class SuiteMemory(NamedTuple):
     """Memory of a `SensorSuite` between control samples."""
 
@@ -99,12 +91,16 @@ class SensorSuite(SpacecraftSensors):
 
     def readings(
         self, memory: SuiteMemory, x: AttitudeState, now: Ticks, dt: Scalar, star_x: Any = None
-    ) -> tuple[Readings, SuiteMemory]:
-        """Return the readings at a sample, and the memory; see `Sensor.measure` for the arguments."""
+    ) -> tuple[list[tuple[Array, Scalar, Array]], Array, SuiteMemory]:
+        """Return the readings at a sample, and the memory; see `Sensor.measure` for the arguments.
+
+        Returns:
+            Reading, weight and age [s] of the delivery of each attitude sensor, the gyro sample (3,) [rad/s], memory.
+        """
         noise_next = self.noise(memory.keys, now.sample + 1)
         *noises, shift = guards.lerp(now.noise_weight, memory.noise, noise_next)
         rate, bias = self.gyro_sample(memory, x.w, shift, now, dt)
-        delivered, ages, waiting = [], [], []
+        delivered, waiting = [], []
         for k, (sensor, noise) in enumerate(zip(self.sensors, noises, strict=True)):
             x_taken = x if star_x is None or star_x[k] is None else star_x[k]
             weight = jnp.where(sensor.times.is_reading_new(now.sample), now.noise_weight, 0.0)
@@ -115,19 +111,17 @@ class SensorSuite(SpacecraftSensors):
             received, queue = _delay_reading(
                 Delivery(sensor.changed(sensor.read(x_taken.q), noise), weight), memory.waiting[k], sensor, now, age
             )
-            delivered.append(received)
-            ages.append(age)
+            delivered.append((*received, age))
             waiting.append(queue)
-        readings = Readings(tuple(delivered), tuple(ages), rate)
-        return readings, memory._replace(noise=noise_next, bias=bias, waiting=tuple(waiting))
+        return delivered, rate, memory._replace(noise=noise_next, bias=bias, waiting=tuple(waiting))
 
     def inputs(
         self, memory: SuiteMemory, x: AttitudeState, now: Ticks, dt: Scalar, star_x: Any = None
     ) -> tuple[dict[str, Array], SuiteMemory]:
         """Return the inputs of exported C at a sample, by name, and the memory; see `Sensor.inputs`."""
-        readings, memory = self.readings(memory, x, now, dt, star_x)
-        named: dict[str, Array] = {"rate": readings.rate}
-        for sensor, (reading, weight), age in zip(self.sensors, readings.delivered, readings.ages, strict=True):
+        delivered, rate, memory = self.readings(memory, x, now, dt, star_x)
+        named: dict[str, Array] = {"rate": rate}
+        for sensor, (reading, weight, age) in zip(self.sensors, delivered, strict=True):
             named[sensor.name] = reading
             named[f"{sensor.name}_valid"] = (weight > 0.0).astype(float)
             named[f"{sensor.name}_age"] = age
@@ -144,9 +138,9 @@ class SensorSuite(SpacecraftSensors):
         self, memory: SuiteMemory, x: AttitudeState, now: Ticks, dt: Scalar, star_x: Any = None
     ) -> tuple[AttitudeState, SuiteMemory]:
         """Return the attitude and rate that the filter estimates, and the memory."""
-        readings, memory_next = self.readings(memory, x, now, dt, star_x)
-        estimate = self.filter.propagate(memory.estimate, readings.rate, dt)
-        for k, ((reading, weight), age) in enumerate(zip(readings.delivered, readings.ages, strict=True)):
+        delivered, rate, memory_next = self.readings(memory, x, now, dt, star_x)
+        estimate = self.filter.propagate(memory.estimate, rate, dt)
+        for k, (reading, weight, age) in enumerate(delivered):
             estimate = self.filter.correct(estimate, k, reading, age, weight)
         return AttitudeState(estimate.q, estimate.w), memory_next._replace(estimate=estimate)
 
