@@ -86,7 +86,7 @@ def changes() -> Iterator[tuple[str, dict[str, Any]]]:
         mine = getattr(PLAIN, table, None)
         if isinstance(kinds, Mapping):
             yield from of_kinds(table, table, kinds, getattr(mine, "kind", None))
-        elif mine is None and table in layouts.OPTIONAL and table not in ("dispersion", "tune"):
+        elif mine is None and table not in ("dispersion", "tune"):
             yield table, {table: {}}
         if mine is not None and table != "tune":
             yield from of_choices(table, mine)

@@ -9,6 +9,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 import pytest
 from polars.testing import assert_frame_equal
@@ -18,7 +19,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.onboard.library import InTheLoop, Library
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.scenario.layouts import OPTIONAL
+from ptsmc_jax.scenario.layouts import SCENARIOS
 from ptsmc_jax.simulation import rollout
 from tests.scenario.test_schema import BUILT_IN
 from tuning.search.gains import gains_of, with_gains
@@ -37,12 +38,13 @@ def drawn(seed):
     for name, some in BUILT_IN:
         if some.get("plant", {}).get("kind", "spacecraft") == kind:
             tables.setdefault(name, []).append(some[name])
+    required = {field.name for field in msgspec.structs.fields(SCENARIOS[kind]) if field.required}
     chosen = {}
     for name, ones in tables.items():
         if name in ("hardware", "dispersion"):
             keys = {key: value for table in chance.sample(ones, len(ones)) for key, value in table.items()}
             chosen[name] = {key: value for key, value in keys.items() if chance.random() < 0.4}
-        elif name not in ("loop", "requirements", "tune") and (name not in OPTIONAL or chance.random() < 0.4):
+        elif name not in ("loop", "requirements", "tune") and (name in required or chance.random() < 0.4):
             chosen[name] = dict(chance.choice(ones))
     chosen["controller"]["t_f"] = chance.uniform(6.0, 12.0)
     loop = {"mode": "sampled", "clock": "flight", "period": chance.choice([0.05, 0.1, 0.17])}

@@ -310,7 +310,7 @@ def _possible_parameters(
         )  # fmt: skip
     quantities: Any = (("amplitude", plant.input_unit, "factor"), ("phase", "rad", "add"))
     for quantity, unit, kind in quantities:
-        count = disturbances.count_values(model.disturbance, quantity)
+        count = disturbances.values(model.disturbance, quantity).size
         if count:
             add(
                 f"disturbance_{quantity}", unit, kind, lambda m, q=quantity: disturbances.values(m.disturbance, q),

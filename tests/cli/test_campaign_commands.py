@@ -231,21 +231,21 @@ def test_interrupted_until_confident_ends_with_the_same_number_of_trials(command
     (tmp_path / "s.toml").write_text(HALF)
     width = "0.12" if before == 0 else "0.135"
     confident = "montecarlo", "s.toml", "--trials", 5000, "--until-confident", width, "--no-figures"
-    put = campaign.Rows.put
+    write = campaign.Rows.write
     for interrupted in (False, True):
         out = "--out", f"out/{interrupted}"
         if before:
             command("montecarlo", "s.toml", "--trials", before, "--no-figures", *out)
         if interrupted:
 
-            def until(self, first, count, content):
-                if first + count > (300 if before == 0 else 250):
+            def until(self, first, frame):
+                if first + frame.height > (300 if before == 0 else 250):
                     raise KeyboardInterrupt
-                return put(self, first, count, content)
+                return write(self, first, frame)
 
-            monkeypatch.setattr(campaign.Rows, "put", until)
+            monkeypatch.setattr(campaign.Rows, "write", until)
             assert command(*confident, *out)[0] == 130
-            monkeypatch.setattr(campaign.Rows, "put", put)
+            monkeypatch.setattr(campaign.Rows, "write", write)
         assert command(*confident, *out)[0] == 1
     whole, again = (tmp_path / "out" / name for name in ("False", "True"))
     assert summary(whole) == summary(again)
