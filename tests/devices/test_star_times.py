@@ -113,7 +113,7 @@ def test_star_tracker_measures_the_attitude_at_its_own_sample_time(run):
     x, looked_at = np.concatenate([parts.initial.q, parts.initial.w]), 0
     for k in range(30):
         if k > 0:
-            t, u, h = simulated.t[k - 1], simulated.torque[k - 1], simulated.t[k] - simulated.t[k - 1]
+            t, u, h = simulated.t[k - 1], simulated.outputs["torque"][k - 1], simulated.t[k] - simulated.t[k - 1]
             there = moved(t, x, u, h - simulated.inputs["attitude_age"][k])
             x = moved(t, x, u, h)
             if simulated.inputs["attitude_valid"][k]:
