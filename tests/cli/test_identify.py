@@ -86,7 +86,7 @@ def test_a_design_has_a_profile_within_the_limits(command, logged):
         ([], "give at least one log file after the scenario, or --design"),
         (["run/trajectory.csv", "--design"], "--design needs no log: leave the log files out"),
         (["run/trajectory.csv", "--rate", "0.1"], "--rate is 0.1, but must be absent without --design"),
-        (["absent.csv"], "there is no file absent.csv; a log is a .csv or .parquet file"),
+        (["absent.csv"], "the log is absent.csv, which does not exist; allowed is a .csv or .parquet file"),
         (["s.toml"], "the log is s.toml, but must be a .csv or .parquet file"),
     ],
 )
