@@ -78,6 +78,3 @@ def identify(
     if not common.quiet:
         terminal.print_result("identify", results.summary(result), loaded.plant.kind, folder)
     return 0 if result.is_identified else 1
-
-
-COMMANDS = (identify,)

@@ -341,8 +341,13 @@ def completion(
     return 0
 
 
-_MODULES = (writing_commands, campaign_commands, identify_command)
-for _command in (one for module in _MODULES for one in module.COMMANDS):
+_COMMANDS = (
+    *writing_commands.COMMANDS,
+    *campaign_commands.COMMANDS,
+    writing_commands.export,
+    identify_command.identify,
+)
+for _command in _COMMANDS:
     app.command(_command)
 
 

@@ -200,4 +200,4 @@ def convert_attitude(
     return 0
 
 
-COMMANDS = (report, new, schema, examples, export, convert_attitude)
+COMMANDS = (report, new, schema, examples, convert_attitude)
