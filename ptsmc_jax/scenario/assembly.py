@@ -129,18 +129,18 @@ def build_setup(scenario: Scenario) -> Setup:
     model = scenario.design_model()
     plant = scenario.true_plant(model)
     signal, walk_rate = build_disturbance(scenario, plant)
-    wheels = scenario.reaction_wheels
-    actuators = scenario.devices.actuators(None if wheels is None else wheels.build())
+    wheels, devices, suite = scenario.reaction_wheels, scenario.devices, scenario.sensors
+    actuators = devices.actuators(None if wheels is None else wheels.build())
     if getattr(getattr(scenario.dispersion, "wheel_failure", None), "known", False):
         actuators = replace(actuators, spare_allocations=spare_allocations(actuators.wheels))
-    command_filter = scenario.devices.command_filter
+    command_filter = devices.command_filter
     return Setup(
         plant=plant,
         disturbance=signal,
         reference=scenario.build_reference(),
         controller=scenario.controller.build(scenario, model),
         observer=scenario.observer.build(scenario, model),
-        sensors=_sensors(scenario, model),
+        sensors=devices.sensors(scenario) if suite is None else suite.build(model, scenario.loop.period),
         initial=plant.with_hidden_at_rest(scenario.initial_state()),
         t_end=vector(scenario.end),
         window=vector(scenario.window),
@@ -150,13 +150,6 @@ def build_setup(scenario: Scenario) -> Setup:
         command_filter=None if command_filter is None else command_filter.part(),
         pointing=scenario.observation(),
     )
-
-
-def _sensors(scenario: Scenario, model: Any) -> Any:
-    """Return the sensors of [sensors] or [[sensors]] if given, otherwise the sensors of [hardware]."""
-    if scenario.sensors is None:
-        return scenario.devices.sensors(scenario)
-    return scenario.sensors.build(model, scenario.loop.period)
 
 
 def build_disturbance(scenario: Scenario, plant: Plant) -> tuple[Any, Any]:

@@ -34,17 +34,15 @@ def check(parts: Parts, dispersion: Dispersion, scenario: Scenario) -> None:
         dispersion: its dispersions, which may be custom too.
         scenario: the scenario that they are built from.
     """
-    tables = {name: getattr(scenario, name, None) for name in ("reference", "sensors", "observer", "controller")}
     signals = iter(parts.disturbance.terms if isinstance(parts.disturbance, Sum) else (parts.disturbance,))
     for place, term in scenario.terms_by_place.items():
         if isinstance(term, Custom):
-            _check_disturbance(
-                parts, next(one for one in signals if isinstance(one, term.part_class)), _Checker(place, term)
-            )
-    for name, table in tables.items():
+            signal = next(one for one in signals if isinstance(one, term.part_class))
+            _check_disturbance(parts, signal, _Checker(place, term))
+    for name, check_part in _CHECKS.items():
+        table = getattr(scenario, name, None)
         if isinstance(table, Custom):
-            _CHECKS[name](parts, _Checker(name, table))
-
+            check_part(parts, _Checker(name, table))
     if dispersion.custom is not None:
         _check_draw(parts, dispersion, _Checker("dispersion.custom", getattr(scenario.dispersion, "custom", None)))
 

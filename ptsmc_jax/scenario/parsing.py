@@ -109,12 +109,11 @@ def parse(raw: Mapping[str, Any], *, run_code: bool = False) -> Scenario:
     plant_table = _parse_table("plant", plant, layout["plant"], context)
     defaults = scenario_class.plant_defaults(plant_table, plant.keys(), law_kind)
     tables: dict[str, Any] = {}
-    required = {field.name for field in msgspec.structs.fields(scenario_class) if field.required}
     for name, kinds in layout.items():
         table = present.get(name, {})
         if isinstance(table, list | tuple):
             tables[name] = _parse_sensor_suite(table, context)
-        elif name in present or name in required:
+        elif name in present or name not in layouts.OPTIONAL:
             tables[name] = _parse_table(name, table, kinds, context, defaults.get(name))
     # plain limits first, as TOML writes them, so that the order of verdicts is the same for a scenario that was saved
     limits = {key: value for key, value in present.get("requirements", {}).items() if value is not None}

@@ -13,9 +13,8 @@ from ptsmc_jax.scenario import disturbance_tables, errors
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.theory import stability_limits
 
-MAX_BOUND_RATIO = (
-    10.0  # largest ratio of a stated bound to the bound of the disturbance, or its inverse, without a warning
-)
+# largest ratio of a stated bound to the bound of the disturbance, or its inverse, without a warning
+MAX_BOUND_RATIO = 10.0
 MAX_DELAY_FRACTION = 0.1  # delay as a fraction of t_f; a longer one was probably given in seconds
 MAX_ATTITUDE_NOISE = np.deg2rad(5.0)  # noise [rad]; a larger one was probably given in another unit
 
