@@ -92,18 +92,16 @@ def parse(raw: Mapping[str, Any], *, run_code: bool = False) -> Scenario:
         ScenarioError: a table or key is unknown, or a value is not allowed.
     """
     _check_shape("", raw, DEEPEST)
-    known_names = {"requirements", *(key for layout in TABLES.values() for key in layout)}
+    kind = _kind_of("plant", raw.get("plant") or {}, TABLES)
+    scenario_class, layout = SCENARIOS[kind], TABLES[kind]
     for name, table in raw.items():
+        if name not in (*layout, "requirements"):
+            raise _unknown_table_error(name, table, kind)
         is_suite = name == "sensors" and isinstance(table, list | tuple)
-        if name in known_names and not isinstance(table, Mapping | None) and not is_suite:
+        if not isinstance(table, Mapping | None) and not is_suite:
             raise wrong(name, table, "a table")
     present = {name: table for name, table in raw.items() if table is not None}
     plant = present.get("plant", {})
-    kind = _kind_of("plant", plant, TABLES)
-    scenario_class, layout = SCENARIOS[kind], TABLES[kind]
-    for name, table in raw.items():
-        if name not in layout and name != "requirements":
-            raise _unknown_table_error(name, table, kind)
     context = Context(scenario_class, run_code)
     law_kind = _kind_of("controller", present.get("controller", {}), typing.cast(Kinds, layout["controller"]))
     plant_table = _parse_table("plant", plant, layout["plant"], context)
@@ -139,6 +137,8 @@ def _check_shape(name: str, value: Any, levels: int) -> None:
 
 def _kind_of(name: str, raw: Mapping[str, Any], kinds: Mapping[str, Any]) -> str:
     """Return the kind of a table, by default the first one; raise ScenarioError if there is no such kind."""
+    if not isinstance(raw, Mapping):
+        raise wrong(name, raw, "a table")
     kind = next(iter(kinds)) if raw.get("kind") is None else raw["kind"]
     if not isinstance(kind, str) or kind not in kinds:
         known = list(map(show, kinds))
@@ -247,11 +247,7 @@ def nearest_name_hint(name: str, known: Iterable[str], template: str = "{}") -> 
 
 
 def _parse_table(
-    name: str,
-    raw: Any,
-    kinds: type[Table] | Kinds,
-    context: Context,
-    defaults: Mapping[str, Any] | None = None,
+    name: str, raw: Any, kinds: type[Table] | Kinds, context: Context, defaults: Mapping[str, Any] | None = None
 ) -> Table:
     """Return a table.
 

@@ -21,7 +21,6 @@ from ptsmc_jax.scenario.values import (
     Kinds,
     Meaning,
     NotNegative,
-    Positive,
     Quantile,
     ResolvedPositive,
     Table,
@@ -58,19 +57,19 @@ class Loop(Table, frozen=True):
         Annotated[str, Meta(description=epochs.ALLOWED)] | None, Meaning("calendar time of t = 0, UTC")
     ] = None
     t_end: Annotated[
-        Positive | None,
+        ResolvedPositive,
         Meaning(
             "end of the run; default: 4/3 t_f or the end of the window for a spacecraft, 3 t_f for other plants", "s"
         ),
-    ] = None
+    ] = ABSENT
     window: Annotated[
-        Positive | None,
+        ResolvedPositive,
         Meaning(
             "length of the window after t_f in which window_error is computed; default: t_f / 30 or a "
             "control period for a spacecraft, t_f / 5 for other plants",
             "s",
         ),
-    ] = None
+    ] = ABSENT
     settling_angle: Annotated[
         ResolvedPositive,
         Meaning(
@@ -386,13 +385,11 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
     @property
     def end(self) -> float:
         """The end of the run, `loop.t_end` [s]."""
-        assert self.loop.t_end is not None, "a scenario that is not resolved"
         return self.loop.t_end
 
     @property
     def window(self) -> float:
         """The length of the window after t_f, `loop.window` [s]."""
-        assert self.loop.window is not None, "a scenario that is not resolved"
         return self.loop.window
 
     def observation(self) -> Any:
