@@ -186,7 +186,7 @@ NUMBERS = {
             for value, allowed in NUMBERS.items()
         ),
         (("simulate", "nothere.toml"), ("nothere.toml does not exist",)),
-        (("simulate", "folder"), ("folder is a folder, but must be a TOML file",)),
+        (("simulate", "folder"), ("folder cannot be read: Is a directory",)),
         (("simulate", "broken.toml"), ("broken.toml is no valid TOML",)),
         (("simulate", "eta.toml"), ("controller.eta is 1.0, but must be a number greater than 2",)),
         (("tune", "eta.toml"), ("controller.eta is 1.0, but must be a number greater than 2",)),
