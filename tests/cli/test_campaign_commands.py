@@ -345,7 +345,7 @@ def test_worst_lists_trials_that_replay_reproduces(command, simulated, tmp_path)
     assert (simulated / "replay" / str(trial) / "trajectory.csv").exists()
     error = refused(command, tmp_path, "replay", FOLDER, "--trial", 250)
     assert "--trial is 250, but must be a whole number from 0 to 249" in error
-    assert "known ones are peak_torque, " in refused(command, tmp_path, "worst", FOLDER, "--by", "peek_torque")
+    assert "the nearest known one is peak_torque" in refused(command, tmp_path, "worst", FOLDER, "--by", "peek_torque")
     error = refused(command, tmp_path, "worst", FOLDER, "--by", "xyz")  # earlier, the error listed all columns
     assert "worst.csv, which ptsmc worst writes without --by, has all of them" in error
     assert error.count(",") < 8
