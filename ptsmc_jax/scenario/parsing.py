@@ -5,6 +5,7 @@ This module validates single tables and keys. `checks` validates constraints bet
 
 import copyreg
 import difflib
+import functools
 import math
 import os
 import re
@@ -35,7 +36,8 @@ from ptsmc_jax.simulation import catalogues
 
 DEEPEST = 8  # nesting of tables and arrays; a rotation matrix of a disturbance in a sum has depth 6
 LONGEST_KEY = 100  # largest number of characters of a key
-MOST_LISTED = 40  # largest number of known names that an error lists
+MOST_LISTED = 20  # largest number of known names that an error lists
+TABLES_OF_NAMES = ("telemetry", "dispersion")  # tables whose keys have the names of other things
 _TOO_DEEP = f"but at most {DEEPEST} levels are allowed"
 # a very long dotted key: the memory that the parser needs for it grows with the square of its length
 _LONG_DOTTED_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){20}""")
@@ -232,7 +234,7 @@ def _without_none(value: Any) -> Any:
 
 
 def nearest_name_hint(name: str, known: Iterable[str], template: str = "{}") -> str:
-    """Return a hint for an unknown name: the most similar known name, or all known names if they are few.
+    """Return a hint for an unknown name: the one or two most similar known names, or all known names if they are few.
 
     Args:
         name: the unknown name.
@@ -240,10 +242,11 @@ def nearest_name_hint(name: str, known: Iterable[str], template: str = "{}") -> 
         template: format of a known name in the hint.
     """
     known = list(known)
-    matches = difflib.get_close_matches(name, known, n=1, cutoff=0.6 if len(known) <= MOST_LISTED else 0.0)
-    if matches:
-        return f"the nearest known one is {template.format(matches[0])}"
-    return f"known are {', '.join(template.format(one) for one in known)}"
+    similar = functools.partial(difflib.get_close_matches, name, known)
+    # a misspelt name has one very similar name; of less similar names the second one may be meant
+    matches = similar(n=1, cutoff=0.85) or similar(n=2, cutoff=0.6 if len(known) <= MOST_LISTED else 0.0)
+    shown = ", ".join(template.format(one) for one in matches or known)
+    return f"the nearest known {'ones are' if matches[1:] else 'one is'} {shown}" if matches else f"known are {shown}"
 
 
 def _parse_table(
@@ -357,14 +360,17 @@ def _parse_fields(
 
 def _unknown_key_error(name: str, key: str, struct: type[Table], context: Context, kinds: Kinds) -> ScenarioError:
     """Return the error for a key that the table of this name does not have; `kinds`: kinds of the table."""
+    known, layout = struct.__struct_fields__, context.scenario_class.TABLES
     others = [show(kind) for kind, other in kinds.items() if key in other.__struct_fields__]
     this_kind = next((kind for kind, other in kinds.items() if other is struct), None)
     other_kinds = f" of {name}.kind = {show(this_kind)}, but of {', '.join(others)}" if others else ""
-    tables = keys.table_names_by_key(context.scenario_class.TABLES).get(key, [])
-    if tables and name not in tables:
+    tables = [table for table in keys.table_names_by_key(layout).get(key, []) if table not in TABLES_OF_NAMES]
+    if key in layout:
+        hint = f"[{key}] is a table of its own"
+    elif tables and name not in tables and not difflib.get_close_matches(key, known):
         hint = f"{', '.join(f'{table}.{key}' for table in tables)} {'are' if tables[1:] else 'is'}"
     else:
-        hint = nearest_name_hint(key, struct.__struct_fields__, f"{name}.{{}}")
+        hint = nearest_name_hint(key, known, f"{name}.{{}}")
     return ScenarioError(f"{name}.{key} is not a known key{other_kinds}; {hint}")
 
 
@@ -389,6 +395,8 @@ def _hint(key: str, value: Any, unit: str) -> str:
     units = [*catalogues.UNITS.get(unit, {})]
     if units and any(isinstance(one, str) for one in (value if isinstance(value, tuple) else [value])):
         return f' [{unit}], or with a unit such as "0.05 {units[:2][-1]}", in {", ".join(units)}'
+    if key == "hardware.attitude_noise" and isinstance(value, tuple):
+        return " for all axes: the largest one, or noise_across and noise_about of a star_tracker in [[sensors]]"
     if key.removeprefix("hardware.") in device_tables.Hardware.noise_keys and isinstance(value, tuple):
         return " for all axes: the largest one, or a custom sensor in [sensors] if they differ"
     return ""
