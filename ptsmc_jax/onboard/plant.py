@@ -113,7 +113,7 @@ def _replace_parts(parts: Parts, values: Values, traced: Values) -> Parts:
 def _draw_trial(parts: Parts, dispersion: Dispersion, values: Values) -> Parts:
     """Return the parts with the dispersions of one trial, selected by the parameters `seed` and `trial`.
 
-    The sign of the initial quaternion, q or -q, is chosen by `Setup.aligned_initial`.
+    The sign of the initial quaternion, q or -q, is chosen by `Parts.aligned_initial`.
     """
     nominal = _replace_parts(parts, values, values)
     if hasattr(nominal.plant, "with_inertia"):  # the inverse and a gravity gradient follow from the inertia

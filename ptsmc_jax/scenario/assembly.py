@@ -19,7 +19,7 @@ from ptsmc_jax.scenario import tables as t
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation import catalogues
-from ptsmc_jax.simulation.assembly import Parts, Setup
+from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.requirements import Requirement
 
 
@@ -124,7 +124,7 @@ def study(
     return Study(scenario, parts, dispersion, requirements(scenario), margin_requirements(scenario))
 
 
-def build_setup(scenario: Scenario) -> Setup:
+def build_setup(scenario: Scenario) -> Parts:
     """Return all parts except the clock, which `timing.choose_timing` derives from the fastest rates of these parts."""
     model = scenario.design_model()
     plant = scenario.true_plant(model)
@@ -134,7 +134,7 @@ def build_setup(scenario: Scenario) -> Setup:
     if getattr(getattr(scenario.dispersion, "wheel_failure", None), "known", False):
         actuators = replace(actuators, spare_allocations=spare_allocations(actuators.wheels))
     command_filter = devices.command_filter
-    return Setup(
+    return Parts(
         plant=plant,
         disturbance=signal,
         reference=scenario.build_reference(),

@@ -24,7 +24,7 @@ from ptsmc_jax.scenario.errors import ScenarioError, show, wrong
 from ptsmc_jax.scenario.tables import Scenario, check_scenario
 from ptsmc_jax.scenario.values import MOST_STEPS
 from ptsmc_jax.simulation import clock
-from ptsmc_jax.simulation.assembly import Parts, Setup
+from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.theory import envelopes, solutions
 
 MOST_SUBSTEPS = 200  # largest number of integration steps in a control period
@@ -99,7 +99,7 @@ def reach_of(scenario: Scenario, **changes: float) -> Reach:
     return reach
 
 
-def choose_timing(scenario: Scenario, setup: Setup, reach: Reach, saves: object) -> tuple[Any, int]:
+def choose_timing(scenario: Scenario, setup: Parts, reach: Reach, saves: object) -> tuple[Any, int]:
     """Return the clock of a run, and the number of integration steps in a control period.
 
     Args:
@@ -195,7 +195,7 @@ def _layer_rates(controller: Any, observer: Any, visited: Any) -> tuple:
     return envelopes.boundary_layer(controller, observer.error_bound().largest, visited)
 
 
-def _with_prescribed_time_law(setup: Setup) -> Setup:
+def _with_prescribed_time_law(setup: Parts) -> Parts:
     """Return the parts with the prescribed-time law. Its exact motion represents the states of a run under any law."""
     law = setup.controller
     if law.prescribed:
@@ -205,7 +205,7 @@ def _with_prescribed_time_law(setup: Setup) -> Setup:
 
 
 @programs.jit
-def _system_rates(setup: Setup, visited: tuple) -> tuple:
+def _system_rates(setup: Parts, visited: tuple) -> tuple:
     """Return Jacobians of a custom system at the visited states, and w' and w'' of the motion with zero error."""
     plant, kinematics = typing.cast(System, setup.plant), setup.controller.kinematics
     zero = jnp.zeros(plant.inputs)
@@ -222,7 +222,7 @@ def _system_rates(setup: Setup, visited: tuple) -> tuple:
     return lapack.vmap(jacobian)(*visited), steady
 
 
-def _fastest_system_rate(setup: Setup, visited: tuple) -> float:
+def _fastest_system_rate(setup: Parts, visited: tuple) -> float:
     """Return the fastest rate of a custom system along its run [rad/s], from its modes and its explicit time."""
     jacobians, (acceleration, jerk) = _system_rates(solutions.without_devices(setup), visited)
     matrices = np.asarray(jacobians)
@@ -249,7 +249,7 @@ def _fastest_layer_rates(reach: Reach, law: Any, observer: Any, visited: Any) ->
 
 
 def _continuous_grid(
-    scenario: Scenario, reach: Reach, setup: Setup, saves: object, frequencies: Mapping[str, float], visited: Any
+    scenario: Scenario, reach: Reach, setup: Parts, saves: object, frequencies: Mapping[str, float], visited: Any
 ) -> clock.Graded:
     """Return the grid of the continuous loop; raise ScenarioError if it needs more than `MOST_STEPS` steps."""
     loop = scenario.loop

@@ -90,9 +90,6 @@ class Parts:
         return replace(self, **changes)
 
 
-Setup = Parts  # parts whose clock is not chosen yet
-
-
 def check_parts(value: object) -> None:
     """Raise TypeError if the argument is not the parts of a run."""
     if not isinstance(value, Parts):

@@ -27,7 +27,7 @@ from ptsmc_jax.laws.prescribed_time import (
 from ptsmc_jax.numerics import attitude, guards, matrices
 from ptsmc_jax.numerics.pytrees import Scalar, Vector
 from ptsmc_jax.plants.rigid_body import AttitudeState
-from ptsmc_jax.simulation.assembly import Setup
+from ptsmc_jax.simulation.assembly import Parts
 
 Derivatives = Float[Array, " n"]  # of an error, or the states of a chain
 State = Float[Array, " twice"]
@@ -274,29 +274,29 @@ def state_envelope(
     return jnp.stack(centre), jnp.stack(half)
 
 
-def without_devices(parts: Setup) -> Setup:
+def without_devices(parts: Parts) -> Parts:
     """Return the parts without clock and devices.
 
     The exact motion does not depend on them, so that one compiled program serves all scenarios.
     """
     names = "plant", "disturbance", "reference", "controller", "initial", "t_end", "window", "settling_angle"
-    return Setup(**{name: getattr(parts, name) for name in names}, observer=None)
+    return Parts(**{name: getattr(parts, name) for name in names}, observer=None)
 
 
-def initial_errors(parts: Setup) -> Float[Array, "m n"]:
+def initial_errors(parts: Parts) -> Float[Array, "m n"]:
     """Return each component of the error and its derivatives x_1 .. x_n at t = 0, in the states' own units."""
     kinematics, target = parts.controller.kinematics, parts.reference(jnp.zeros_like(parts.t_end))
     return kinematics.derivatives(parts.aligned_initial, target)
 
 
-def exact_sizes(parts: Setup, t: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+def exact_sizes(parts: Parts, t: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Return the 2-norms of the error and of s along the exact motion at times t (time,) [s] in the approach phase."""
     error, s = _exact_sizes(without_devices(parts), jnp.asarray(t))
     return np.asarray(error), np.asarray(s)
 
 
 @programs.jit
-def _exact_sizes(parts: Setup, t: Array) -> tuple[Array, Array]:
+def _exact_sizes(parts: Parts, t: Array) -> tuple[Array, Array]:
     """Return the 2-norms of the error and of s at times t, see `exact_sizes`."""
 
     def norms(time: Scalar) -> tuple[Scalar, Scalar]:
@@ -306,7 +306,7 @@ def _exact_sizes(parts: Setup, t: Array) -> tuple[Array, Array]:
     return jax.vmap(norms)(t)
 
 
-def exact_input(parts: Setup, t: Scalar) -> tuple[Array, Scalar]:
+def exact_input(parts: Parts, t: Scalar) -> tuple[Array, Scalar]:
     """Return the input (m,) [N m] of the exact motion at t [s], and the distance to the singularity.
 
     For attitudes this distance is 1 - |v|^2 [-], the square of the scalar part. The motion does not exist if it is 0
@@ -318,7 +318,7 @@ def exact_input(parts: Setup, t: Scalar) -> tuple[Array, Scalar]:
     return plant.input_for(t, motion.x, motion.w_dot, d), motion.singularity_distance
 
 
-def visited_states(parts: Setup) -> tuple[Array, Any]:
+def visited_states(parts: Parts) -> tuple[Array, Any]:
     """Return targets and states of a second-order run, (2 VISITED,) each, in the states' own units.
 
     The first half is on the exact motion, at times that become denser toward the hand-over. In the second half the
@@ -328,7 +328,7 @@ def visited_states(parts: Setup) -> tuple[Array, Any]:
 
 
 @programs.jit
-def _visited_states(parts: Setup) -> tuple[Array, Any]:
+def _visited_states(parts: Parts) -> tuple[Array, Any]:
     law, fractions = parts.controller, jnp.linspace(0.0, 1.0, VISITED)
     zero_errors = (jnp.zeros(parts.plant.inputs),) * 3
 
@@ -345,7 +345,7 @@ def _visited_states(parts: Setup) -> tuple[Array, Any]:
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), early, late)
 
 
-def exact_path(parts: Setup, points: int = 2000) -> tuple[Array, Array, Array]:
+def exact_path(parts: Parts, points: int = 2000) -> tuple[Array, Array, Array]:
     """Return times in the approach phase [s], inputs (points, m) and distances to the singularity of the exact motion.
 
     The times become denser toward the hand-over. `exact_input` defines inputs and distances.
@@ -354,7 +354,7 @@ def exact_path(parts: Setup, points: int = 2000) -> tuple[Array, Array, Array]:
 
 
 @programs.jit(static_argnames="points")
-def _exact_path(parts: Setup, points: int) -> tuple[Array, Array, Array]:
+def _exact_path(parts: Parts, points: int) -> tuple[Array, Array, Array]:
     """Return times (points,) [s], inputs and distances to the singularity, see `exact_path`."""
     law = parts.controller
     t = law.t_f - law.t_f * (law.delta / law.t_f) ** jnp.linspace(0.0, 1.0, points)
@@ -362,7 +362,7 @@ def _exact_path(parts: Setup, points: int) -> tuple[Array, Array, Array]:
     return t, u, singularity_distance
 
 
-def exact_peak(parts: Setup, points: int = 400) -> Scalar:
+def exact_peak(parts: Parts, points: int = 400) -> Scalar:
     """Return the largest input of the exact motion before the hand-over [N m].
 
     This generalises rule 3.5 to any initial state, reference and order.
