@@ -3,6 +3,7 @@
 A written scenario has every key of its plant. Keys in comments are valid as soon as the # is removed.
 """
 
+import io
 import json
 import os
 import re
@@ -124,6 +125,14 @@ def test_new_command_does_not_overwrite_files(command, tmp_path):
     )
     assert command("new", "--like", FLIGHT, "--force", "--quiet") == (0, "", "")
     assert (tmp_path / "scenario.toml").read_text() == new.scenario_text(None, parsing.load(FLIGHT)) != written
+
+
+def test_file_name_is_escaped_if_the_output_encoding_lacks_its_letters(command, tmp_path, monkeypatch):
+    plain = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", plain)
+    assert command("new", "größe.toml")[::2] == (0, "")
+    plain.seek(0)
+    assert plain.read() == "scenario in gr\\xf6\\xdfe.toml\n"
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import io
 import sys
 from pathlib import Path
 from typing import Annotated, Literal
@@ -354,6 +355,8 @@ for _command in _COMMANDS:
 def main() -> None:
     """Run a command; a configuration error ends it with one sentence and exit status 2, without a traceback."""
     status: object = None
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")  # like the error stream: file names contain any character
     try:
         status = app(sys.argv[1:], exit_on_error=False, print_error=False, result_action="return_value")
     except KeyboardInterrupt as error:
