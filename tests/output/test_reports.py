@@ -340,7 +340,16 @@ def winner(least: float) -> str:
 
 def run(lower_bound: float | None) -> Report:
     told = {"status": "ok", "reason": "", "bad_time": None, "window_error": 1e-5, "verdicts": {}, "warnings": []}
-    return reports.build("simulate", {**told, "lower_bound": lower_bound}, "spacecraft")
+    angles = {"window_angle": 2e-5, "hold_angle": 0.02, "peak_rate": 0.02}  # in arcsec, in deg, and no angle
+    return reports.build("simulate", {**told, **angles, "lower_bound": lower_bound}, "spacecraft")
+
+
+def quantiles_of_angles() -> list[Table]:
+    """Return the table of a metric in rad whose largest value is above one degree, and of one that is not."""
+    tail = {"value": 4e-5, "low": 3e-5, "high": 6e-5}
+    small = {"without_value": 0, "max": 7e-5, "0.5": {"value": 1e-5, "low": 9e-6, "high": 2e-5}, "0.9973": tail}
+    quantiles = {"window_angle": small, "hold_angle": {**small, "max": 0.02}}
+    return campaign_report.quantile_tables(examples.campaign(quantiles=quantiles))
 
 
 def approach(judged: bool) -> Report:
@@ -389,6 +398,7 @@ OTHERS: dict[str, Callable[[], Any]] = {
     ],
     "most accurate law, also without an error": lambda: [winner(2e-6), winner(0.0)],
     # the bound is 0 without noise, and None if no run reaches its end
+    "angles of a campaign in arcsec and deg": quantiles_of_angles,
     "run without a lower bound": lambda: [text_of(run(None)), text_of(run(0.0))],
     "unstable sample of the approach phase": lambda: approach(judged=True),
     "unstable sample that is not judged": lambda: approach(judged=False),

@@ -11,7 +11,15 @@ from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.catalogues import AXES, INDICES, percent
 from ptsmc_jax.simulation.requirements import fewest_trials
 from tuning.output import report
-from tuning.output.formats import add_unit, format_angle, format_count, format_named_error, format_number, list_counts
+from tuning.output.formats import (
+    add_unit,
+    format_angle,
+    format_count,
+    format_named_error,
+    format_number,
+    in_readable_unit,
+    list_counts,
+)
 from tuning.output.report import Block, Report, Section, Table, Text
 from tuning.output.summaries import Campaign, Entry, Row
 
@@ -103,13 +111,10 @@ def quantile_tables(summary: Campaign) -> list[Table]:
             if _is_pointing_index(name) or tail is None:
                 continue
             has_missing_values = quantiles.without_value > failed  # for example of runs that end but never settle
-            numbers = (
-                format_number(quantiles.median["value"], ".3g"),
-                format_number(tail["value"], ".3g"),
-                "..".join(format_number(tail[end], ".3g") for end in ("low", "high")),
-                "none" if has_missing_values else format_number(getattr(quantiles, worst), ".3g"),
-            )
-            rows.append((name, *numbers, units.get(name, "")))
+            values = quantiles.median["value"], tail["value"], tail["low"], tail["high"], getattr(quantiles, worst)
+            unit, shown = in_readable_unit(units.get(name, ""), *values)
+            median, bound, low, high, extreme = (format_number(value, ".3g") for value in shown)
+            rows.append((name, median, bound, f"{low}..{high}", "none" if has_missing_values else extreme, unit))
         if rows:
             tables.append(Table(head, rows, note))
     return tables

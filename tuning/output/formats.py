@@ -49,6 +49,21 @@ def format_angle(value: float | None) -> str:
     return f"{arcsec:.0f} arcsec" if abs(arcsec) >= 999.5 else f"{arcsec:.3g} arcsec"
 
 
+def in_readable_unit(unit: str, *values: float | None) -> tuple[str, list[float | None]]:
+    """Return values of a metric in a readable unit: angles [rad] in arcsec or, from one degree on, in degrees.
+
+    >>> in_readable_unit("rad", 1e-3, None)[0], in_readable_unit("rad", 0.1)[0], in_readable_unit("N m", 0.1)
+    ('arcsec', 'deg', ('N m', [0.1]))
+    """
+    if unit != "rad":
+        return unit, [*values]
+    from ptsmc_jax.formulas import angle_unit  # here, so that `ptsmc --help` does not import NumPy
+
+    sizes = [abs(value) for value in values if value is not None and math.isfinite(value)]
+    unit, factor = angle_unit(max(sizes, default=0.0))
+    return unit, [None if value is None else factor * value for value in values]
+
+
 def format_error(value: float | None, plant: str) -> str:
     """Return a window error as a pointing angle, or in the unit of the state of a plant that is no spacecraft.
 

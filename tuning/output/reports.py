@@ -12,6 +12,7 @@ from tuning.output.formats import (
     format_metric,
     format_named_error,
     format_number,
+    in_readable_unit,
     list_counts,
     parse_cell,
 )
@@ -55,11 +56,11 @@ def run_report(summary: summaries.Run, plant: str) -> Report:
     if summary.controller_statuses:
         lines.append(f"samples of the controller: {list_counts(summary.controller_statuses)}")
     missing = "never" if summary.status in ("ok", "not_converged") else "-"
-    rows = [
-        (name, format_number(summary.metrics[name], ".5g", missing), entry.unit, entry.meaning)
-        for name, entry in CATALOGUES[plant].items()
-        if name in summary.metrics
-    ]
+    rows = []
+    for name, entry in CATALOGUES[plant].items():
+        if name in summary.metrics:
+            unit, (value,) = in_readable_unit(entry.unit, summary.metrics[name])
+            rows.append((name, format_number(value, ".5g", missing), unit, entry.meaning))
     metrics = Section("Metrics", [Table(("metric", "value", "unit", "meaning"), rows)])
     sections = [*report.requirement_sections(summary.verdicts), metrics]
     return Report(headline, mood, [*lines, *report.warning_lines(summary.warnings)], sections)
