@@ -495,6 +495,20 @@ def test_driver_explains_a_significant_part_of_the_variance(correlation, trials,
     assert line == (driven if named else NO_DRIVER)
 
 
+@pytest.mark.parametrize(
+    ("plant", "shown", "title"),
+    [
+        ("spacecraft", np.degrees(2.0 * np.arcsin(1e-5)) * 3600.0, "rms pointing error [arcsec]"),
+        ("chain", 1e-5, "rms error [x1]"),
+    ],
+)
+def test_chart_of_a_search_shows_the_error_in_the_unit_of_the_figures(plant, shown, title):
+    rows = [{"step": "0", "start": "0", "rms_window_error": "1e-05", "eta": "3"}]
+    chart = page_charts.search(rows, "rms_window_error", plant)
+    assert chart["data"][0]["y"] == pytest.approx([shown], rel=1e-5)  # with six digits
+    assert chart["layout"]["yaxis"]["title"]["text"] == title
+
+
 if __name__ == "__main__":
     EXPECTED.write_text("\n\n".join(f"## {name}\n{text_of(case())}" for name, case in CASES.items()) + "\n")
 

@@ -199,7 +199,7 @@ def _search_chart(result: Result) -> Chart:
     head, *rows = _read_rows(result.folder / "history.csv")
     points = [dict(zip(head, row, strict=True)) for row in rows]
     caption = "The objective along the local search from each starting point; a hollow point breaks a limit."
-    return Chart("search", page_charts.search(points, head[2]), caption)
+    return Chart("search", page_charts.search(points, head[2], result.plant), caption)
 
 
 def _front_chart(result: Result) -> Chart:

@@ -203,8 +203,18 @@ def laws(
     return {"data": data, "layout": _layout(xaxis=x_axis, yaxis=y_axis, shapes=lines, annotations=notes)}
 
 
-def search(rows: Sequence[Mapping[str, str]], objective: str) -> Chart:
-    """Return the chart of the objective over the steps of every local search; hollow points break a limit."""
+def search(rows: Sequence[Mapping[str, str]], objective: str, plant: str) -> Chart:
+    """Return the chart of the objective over the steps of every local search; hollow points break a limit.
+
+    Args:
+        rows: the rows of `history.csv`, by column.
+        objective: column of the objective. The window error of a spacecraft is shown as a pointing angle.
+        plant: kind of the plant.
+    """
+    title, convert = objective, np.asarray
+    if objective.endswith("window_error"):
+        convert, name, unit = error_display(plant)
+        title = f"{objective.removesuffix('window_error')}{name} [{unit}]"
     starts: dict[str, list[Mapping[str, str]]] = {}
     for row in rows:
         starts.setdefault(row["start"], []).append(row)
@@ -212,17 +222,18 @@ def search(rows: Sequence[Mapping[str, str]], objective: str) -> Chart:
     gains = [name for name in rows[0] if name not in ("step", "start", objective, *ratio_columns)]
     data = []
     for k, (start, steps) in enumerate(starts.items()):
+        values = np.array([float(row[objective] or "nan") for row in steps])
         met = [all(float(row[name] or "nan") <= 1.0 for name in ratio_columns) for row in steps]
         data.append({
             "type": "scatter", "mode": "lines+markers", "name": f"start {start}",
             "x": [int(row["step"]) for row in steps],
-            "y": to_json_numbers(np.array([float(row[objective] or "nan") for row in steps])),
+            "y": to_json_numbers(convert(values)),
             "text": [", ".join(f"{name} {float(row[name]):.4g}" for name in gains) for row in steps],
-            "hovertemplate": "step %{x}: %{y:.3e}<br>%{text}<extra></extra>",
+            "hovertemplate": "step %{x}: %{y:.4g}<br>%{text}<extra></extra>",
             "marker": {"size": 6, "symbol": ["circle" if one else "circle-open" for one in met]},
             "line": {"width": 1, "color": COLOURS[k % len(COLOURS)]},
         })  # fmt: skip
-    y_axis = {"title": {"text": objective.replace("_", " ")}, **_DECADES}
+    y_axis = {"title": {"text": title.replace("_", " ")}, **_DECADES}
     return {"data": data, "layout": _layout(xaxis={"title": {"text": "step of the local search"}}, yaxis=y_axis)}
 
 
