@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import jax  # noqa: F401  # first: from a deeper stack, Python 3.11 may need 0.2 s longer, for memory of its frames
 import msgspec
 
 from ptsmc_jax.declare import Scaled
