@@ -49,7 +49,12 @@ class Rows:
     key: bytes  # key of the checksums in the file names, see `campaign_key`
 
     def write(self, first: int, frame: pl.DataFrame) -> Part:
-        """Write a part, as a temporary file that is renamed at the end. Raises OSError if the disk is full."""
+        """Write a part as a Parquet file, first under a temporary name. Raises OSError if the disk is full.
+
+        Args:
+            first: number of its first trial.
+            frame: its rows, one for each trial.
+        """
         count, content = frame.height, encode_parquet(frame)
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self.folder / f"{first:010d}-{first + count - 1:010d}-{self.checksum(first, count, content)}.parquet"
@@ -95,9 +100,14 @@ class Rows:
 
 @functools.cache
 def _file_checksum(rows: Rows, path: Path, version: tuple[int, int, int], first: int, count: int) -> str:
-    """Return the checksum of a file. An unchanged file is not read again.
+    """Return the checksum of a part's file; the cache saves reading an unchanged file again.
 
-    version: inode, size and time of the last change [ns].
+    Args:
+        rows: the campaign's parts, with the key of the checksum.
+        path: the Parquet file of the part.
+        version: inode, size and time of the last change of the file [ns].
+        first: number of the part's first trial.
+        count: number of its trials.
     """
     return rows.checksum(first, count, path.read_bytes())
 

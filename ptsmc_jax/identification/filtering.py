@@ -254,7 +254,7 @@ def _rotation_matrix(rotation_vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
 def _predict(
     model: Model, carry: FilterState, t: Scalar, dt: Scalar, command: Array, acting: Array, kind: LogKind
 ) -> FilterState:
-    """Return the filter after an interval, before the readings at its end."""
+    """Return the state of the filter predicted for the end of an interval, before the readings there."""
     plant, actuators = model.plant, model.actuators
     if kind.wheel_inertia is not None:  # the wheels' momentum is measured
         scale = 1.0 if actuators.scale is None else actuators.scale

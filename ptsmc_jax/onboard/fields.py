@@ -159,7 +159,7 @@ class Parameters:
         return jax.make_jaxpr(apply_rules)(self.leaves)
 
     def add_rule(self, rule: Rule) -> None:
-        """Mark the results of a rule as derived, or as underivable if C cannot compute them."""
+        """Note which C parameters a rule computes from other parameters; without such C code they are underivable."""
         closed = self.trace([*self.rules, rule])
         jaxpr, inputs_of_result = closed.jaxpr, dict[str, list[str]]()
         input_index = {variable: k for k, variable in enumerate(jaxpr.invars)}

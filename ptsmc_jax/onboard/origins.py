@@ -137,7 +137,7 @@ def _span(node: Any) -> Span:
 
 @functools.cache
 def _function_summary(file: str, line_number: int) -> str:
-    """Return the summary of the innermost function that contains a line."""
+    """Return the first docstring line of the innermost function that contains a line of a source file."""
     functions = (
         node
         for node in ast.walk(_syntax_tree(file))

@@ -141,7 +141,7 @@ class Translator:
         kind = kind_of(aval.dtype)
 
         def fold(op: str, items: Sequence[Node]) -> Node:
-            """Return the sum, product or extreme of numbers, from the first to the last."""
+            """Return the node of the sum, product, minimum or maximum of nodes, taken from the first to the last."""
             first, *others = items or [pool.constant(op in ("and", "mul"), kind)]
             return functools.reduce(partial(ELEMENTWISE[op], pool, eqn.params, kind), others, first)
 

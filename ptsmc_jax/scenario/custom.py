@@ -162,7 +162,7 @@ def load_table(table: Any, name: str, code: object) -> Any:
 
 @functools.lru_cache(maxsize=256)
 def _add_class_keys(table: Any, custom_class: Any) -> Any:
-    """Return the table with the keys of a class; raise ValueError if the class is not allowed."""
+    """Return a table with a key for each field of a custom class; raise ValueError for fields that it cannot have."""
     base = table.base
     if all(getattr(custom_class, method, None) is getattr(base, method, None) for method in table.required_methods):
         raise ValueError(f"the class {custom_class.__name__} has no method {' or '.join(table.required_methods)}")

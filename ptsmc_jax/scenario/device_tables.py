@@ -387,7 +387,7 @@ class WheelLimits(Table, frozen=True):
             raise wrong("wheels.momentum", self.momentum, f"within wheels.momentum_limit, {limit}")
 
     def build(self) -> Any:
-        """Return the wheels of `devices.actuators`."""
+        """Return the reaction wheels of this table, a `devices.actuators.Wheels`."""
         return wheels(self.spin_axes(), self.momentum, self.torque_limit, self.momentum_limit)
 
 

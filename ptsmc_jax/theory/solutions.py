@@ -319,10 +319,10 @@ def exact_input(parts: Parts, t: Scalar) -> tuple[Array, Scalar]:
 
 
 def visited_states(parts: Parts) -> tuple[Array, Any]:
-    """Return targets and states of a second-order run, (2 VISITED,) each, in the states' own units.
+    """Return targets and states that a run of a second-order plant visits, (2 VISITED,) each, in the states' units.
 
-    The first half is on the exact motion, at times that become denser toward the hand-over. In the second half the
-    error is zero.
+    They are samples for estimates of rates and bounds. The first half is on the exact motion, at times that become
+    denser toward the hand-over. The second half is at the same targets with zero error.
     """
     return _visited_states(without_devices(parts))
 
@@ -346,9 +346,10 @@ def _visited_states(parts: Parts) -> tuple[Array, Any]:
 
 
 def exact_path(parts: Parts, points: int = 2000) -> tuple[Array, Array, Array]:
-    """Return times in the approach phase [s], inputs (points, m) and distances to the singularity of the exact motion.
+    """Return times in the approach phase [s], and the law's input and distance to its singularity at these times.
 
-    The times become denser toward the hand-over. `exact_input` defines inputs and distances.
+    They belong to the exact motion, without noise, devices and disturbance; see `exact_input`. The times become denser
+    toward the hand-over to the hold phase. Shapes: (points,), (points, m) and (points,).
     """
     return _exact_path(without_devices(parts), points)
 

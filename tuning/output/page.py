@@ -110,7 +110,7 @@ def read(folder: Path) -> Result:
 
 
 def _read_rows(path: Path) -> list[list[str]]:
-    """Return the rows of a CSV file with its head."""
+    """Return all rows of a CSV file; the first one has the names of the columns."""
     with path.open(newline="", encoding="utf-8") as file:
         return list(csv.reader(file))
 

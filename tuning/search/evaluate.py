@@ -111,7 +111,7 @@ class Evaluator:
     def _add_margins(
         self, values: dict[str, np.ndarray], problem: Problem, normalised: np.ndarray
     ) -> dict[str, np.ndarray]:
-        """Append the rows of the margins to the fields of a measurement."""
+        """Return a measurement (by field) with the stability margins as further rows of its constraints c."""
         assert problem.margins is not None
         # margins always come with gradients: the compilation of a second program would take longer than it saves
         of_margins = margin_rows.constraints_at_points(problem.margins, self.bounds.scale, normalised)

@@ -375,6 +375,7 @@ class LocalSearches:
         worst = largest_ratios(measure(self.normalised[None]).c, 0.0)[0]
 
         def find_smallest_ratio(row: int) -> float | None:
+            """Return the smallest ratio to its limit that this constraint reaches while the others hold, if any."""
             others, ratios = np.arange(worst.size) != row, list[tuple[float, float]]()
 
             def record_ratios(measured: MeasurementWithGradients) -> None:

@@ -122,7 +122,7 @@ class Rivals:
 
     @property
     def codes(self) -> list[str]:
-        """The locations of the custom laws with symbolic links resolved, without duplicates."""
+        """The custom laws as FILE:CLASS or MODULE:CLASS, with symbolic links resolved, without duplicates."""
         parts = (location.rpartition(":") for location in self.custom)
         codes = (f"{os.path.realpath(at)}:{name}" if at.endswith(".py") else f"{at}:{name}" for at, _, name in parts)
         return list(dict.fromkeys(codes))
