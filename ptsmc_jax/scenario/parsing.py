@@ -367,7 +367,7 @@ def _unknown_key_error(name: str, key: str, struct: type[Table], context: Contex
     tables = [table for table in keys.table_names_by_key(layout).get(key, []) if table not in TABLES_OF_NAMES]
     if key in layout:
         hint = f"[{key}] is a table of its own"
-    elif tables and name not in tables and not difflib.get_close_matches(key, known):
+    elif tables and name not in tables and not difflib.get_close_matches(key, known, cutoff=0.85):
         hint = f"{', '.join(f'{table}.{key}' for table in tables)} {'are' if tables[1:] else 'is'}"
     else:
         hint = nearest_name_hint(key, known, f"{name}.{{}}")
