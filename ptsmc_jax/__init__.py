@@ -4,17 +4,15 @@ Start with `read` and `simulate`. The names in `__init__.pyi` are imported at th
 package does not import JAX.
 """
 
-import ast
 import importlib
+import re
 from pathlib import Path
 from typing import Any
 
 __version__ = "0.1.0"
 
-_STUB = ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
-_EXPORTS = {
-    alias.name: str(node.module) for node in _STUB.body if isinstance(node, ast.ImportFrom) for alias in node.names
-}
+_STUB = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
+_EXPORTS = {name: module for module, name in re.findall(r"^from (\S+) import (\w+) as", _STUB, re.MULTILINE)}
 
 
 def __getattr__(name: str) -> Any:

@@ -19,7 +19,7 @@ from ptsmc_jax.onboard.folder import on_flight_clock
 from ptsmc_jax.scenario import Study, reading
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.theory.run_margins import Course
-from tuning.output import campaign_report, front_report, margins_report, reports, summaries, tune_report
+from tuning.output import front_report, reports
 from tuning.output.report import Report, Table
 from tuning.studies import (
     campaign_figures,
@@ -110,7 +110,7 @@ class Tuned(Outcome):
     @property
     def report(self) -> Report:
         """The report of `ptsmc tune`."""
-        return tune_report.build(summaries.tune(self.summary))
+        return reports.build("tune", self.summary, self.original.plant.kind)
 
     def _figures(self) -> dict[str, Any]:
         return tune_files.figures_of(self.original, self.tuning)
@@ -194,7 +194,7 @@ class Margins(Outcome):
     @property
     def report(self) -> Report:
         """The report of `ptsmc margins`."""
-        return margins_report.build(summaries.read(summaries.Margins, stability.summary(self.ready, self.course)))
+        return reports.build("margins", stability.summary(self.ready, self.course), self.ready.scenario.plant.kind)
 
     def _figures(self) -> dict[str, Any]:
         return stability.figures_of(self.ready, self.course)
@@ -231,7 +231,7 @@ class Campaign(Outcome):
     @property
     def report(self) -> Report:
         """The report of `ptsmc montecarlo`."""
-        return campaign_report.build(summaries.read(summaries.Campaign, self.summary))
+        return reports.build("montecarlo", self.summary, self.folder.scenario.plant.kind)
 
     @property
     def rows(self) -> pl.DataFrame:
@@ -298,7 +298,7 @@ class Reproduced(Outcome):
     @property
     def report(self) -> Report:
         """The report of `ptsmc reproduce`."""
-        return reports.paper_report(reproduction.summary(self.reproduction))
+        return reports.build("reproduce", reproduction.summary(self.reproduction), "spacecraft")
 
     def _figures(self) -> dict[str, Any]:
         return reproduction.figures_of(self.reproduction)

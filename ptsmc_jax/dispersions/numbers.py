@@ -183,10 +183,10 @@ class RelativeInertia:
     ) -> tuple[Float[Array, "3"], Array]:
         """Sample moments of a slender body whose two larger moments differ by at most the smallest one.
 
-        Let the nominal moments be a, b >= c with the standardised errors s_a, s_b, s_c. With r^2 = a^2 + b^2, s_a and
-        s_b are replaced by u = (a s_a - b s_b) / r and v = (b s_a + a s_b) / r, which are independent normal numbers as
-        well. The sample is physical if |a - b + std r u| <= c (1 + std s_c), an interval of u with the probability
-        W(s_c). So s_c has the normal density times W, u given s_c is normal inside the interval, and v is normal.
+        Let the nominal moments be a, b >= c with the standardised errors s_a, s_b, s_c. Two other independent normal
+        numbers replace s_a and s_b: u = (a s_a - b s_b) / r and v = (b s_a + a s_b) / r with r^2 = a^2 + b^2. The
+        sample is physical if |a - b + std r u| <= c (1 + std s_c), an interval of u with the probability W(s_c). So s_c
+        has the normal density times W, u given s_c is normal inside the interval, and v is normal.
 
         s_c is sampled by rejection from a normal number. s_c is accepted with the probability W(s_c) / 2 W(0), -s_c
         with the probability W(-s_c) / 2 W(0), and otherwise the sample is rejected. The sum of both probabilities is at

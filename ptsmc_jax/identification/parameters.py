@@ -279,7 +279,7 @@ def _possible_parameters(
         possible[name] = lambda: _number_parameter(name, unit, kind, model, get, put, *prior_sigma(name, count))
 
     def add_vector(name: str, unit: str, kind: str, path: str, count: int) -> None:
-        """Add the numbers at a path of the model, (count,); None stands for ones."""
+        """Add the numbers at a path of the model, (count,). If the model has None there, they are 1."""
 
         def get(model: Model) -> Any:
             value = paths.get(model, path)

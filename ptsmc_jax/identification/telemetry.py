@@ -23,7 +23,6 @@ from ptsmc_jax.simulation.catalogues import UNITS
 
 MIN_ROWS = 10  # smallest number of rows of a log
 NORM_TOLERANCE = 1e-3  # largest error of the norm of a quaternion: telemetry often has few digits
-RPM = 2.0 * np.pi / 60.0  # one revolution per minute [rad/s]
 MAX_GYRO_DIFFERENCE = 0.5  # largest median difference between attitude and gyro, relative to the rotation
 OUTLIER_RATIO = 10.0  # third difference of an outlier, relative to the median
 COMPARED_PARTS = 400  # number of parts of a log in which attitude and gyro are compared
@@ -254,7 +253,7 @@ def _read_torques_or_speeds(scenario: Any, config: Any, table: _Table, t: Values
         raise RefusedError(f"telemetry.{key} has {len(columns)} columns, but must have {count}, one for each wheel")
     if key == "wheel_torque":
         return table.read_commands(columns, torque_unit), True
-    speeds = table.read_numbers(columns, RPM if config.speed_unit == "rpm" else 1.0)
+    speeds = table.read_numbers(columns, UNITS["rad/s"][config.speed_unit])
     for k, column in enumerate(columns):
         has_speed = ~np.isnan(speeds[:, k])
         if not has_speed.any():

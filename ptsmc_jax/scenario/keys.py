@@ -4,6 +4,7 @@ They come from the declarations, types and defaults of the table classes. Error 
 reference page of scenarios are made from them.
 """
 
+import functools
 import types
 import typing
 from collections.abc import Mapping
@@ -31,7 +32,8 @@ class Key(NamedTuple):
         return self.meaning + (f" [{self.unit}]" if self.unit else "")
 
 
-def list_keys(struct: type[Table], unit_of_d: str = UNIT_OF_D) -> list[Key]:
+@functools.lru_cache(maxsize=512)  # every parsed table needs it; custom classes have tables of their own
+def list_keys(struct: type[Table], unit_of_d: str = UNIT_OF_D) -> tuple[Key, ...]:
     """Return the keys of a table, without `kind`, in the order of the struct.
 
     For a custom kind, only the keys that all custom parts share are known here. The keys of its class are in `rest`.
@@ -50,7 +52,7 @@ def list_keys(struct: type[Table], unit_of_d: str = UNIT_OF_D) -> list[Key]:
         unit = unit.replace(UNIT_OF_D, unit_of_d)
         unit = unit.replace("unit of u", "N m") if unit_of_d == "N m" else unit
         keys.append(Key(field.name, meaning, unit, allowed_values(type_), default, type_))
-    return keys
+    return tuple(keys)
 
 
 def description(struct: type[Table]) -> str:

@@ -312,7 +312,7 @@ def _label_with_unit(scenario: Scenario, key: str) -> str:
     """Return a key with its unit from the schema of its table; without a unit if the scenario has no such table."""
     table, _, name = key.partition(".")
     declared = getattr(scenario, table, None)
-    known_keys = [] if declared is None else keys.list_keys(type(declared), scenario.unit_of_d)
+    known_keys = () if declared is None else keys.list_keys(type(declared), scenario.unit_of_d)
     unit = next((entry.unit for entry in known_keys if entry.name == name.partition("[")[0]), "")
     return f"{key} [{unit}]" if unit else key
 
