@@ -6,6 +6,7 @@ Read `run_in_lockstep` first.
 
 import threading
 from collections.abc import Callable, Sequence
+from queue import SimpleQueue
 from typing import Any
 
 Ask = Callable[[Any], Any]
@@ -29,54 +30,68 @@ def run_in_lockstep(
         BaseException: The exception of a function or of `answer`. An exception of `answer`, such as KeyboardInterrupt,
             is first raised inside the functions that wait.
     """
-    condition = threading.Condition()
+    # Queues only wake threads that wait; the dictionaries hold the state. Waiting for a `SimpleQueue` can be interrupted
+    # safely, unlike waiting for a `threading.Condition`.
     requests, answers = dict[int, Any](), dict[int, Any]()  # of the functions that wait, by their numbers
     ended = dict[int, BaseException | None]()  # exceptions of the functions that have ended
+    changed, woken = SimpleQueue[None](), [SimpleQueue[None]() for _ in functions]
+    waiting = SimpleQueue[int | None]()  # numbers of functions to run; None ends a thread
 
-    def run(number: int) -> None:
+    def run(number: int) -> BaseException | None:
         def ask(request: Any) -> Any:
-            with condition:
-                requests[number] = request
-                condition.notify_all()
-                condition.wait_for(lambda: number in answers)
-                received = answers.pop(number)
+            requests[number] = request
+            changed.put(None)
+            while number not in answers:
+                woken[number].get()
+            received = answers.pop(number)
             if isinstance(received, BaseException):
                 raise received
             return received
 
-        exception = None
         try:
             functions[number](ask)
         except BaseException as error:
-            exception = error
-        with condition:
-            ended[number] = exception
-            condition.notify_all()
+            return error
+        return None
+
+    def work() -> None:
+        while (number := waiting.get()) is not None:
+            ended[number] = run(number)
+            changed.put(None)
 
     running, started, failure = set[int](), 0, None
-    with condition:
+    try:
+        for _ in range(min(width, len(functions))):
+            threading.Thread(target=work, daemon=True).start()
         while True:
-            failure = failure or next(filter(None, ended.values()), None)
-            running.difference_update(ended)
-            while started < len(functions) and failure is None and len(running) < width:
-                threading.Thread(target=run, args=(started,), daemon=True).start()
-                running.add(started)
-                started += 1
-            if not running:
-                break
             try:
-                condition.wait_for(lambda: running <= requests.keys() | ended.keys())
+                for number in list(answers):
+                    woken[number].put(None)
+                failure = failure or next(filter(None, ended.values()), None)
+                running.difference_update(ended)
+                while started < len(functions) and failure is None and len(running) < width:
+                    waiting.put(started)
+                    running.add(started)
+                    started += 1
+                if not running:
+                    break
+                # if a function has ended, another function starts first, and its request joins this batch
+                if not running.isdisjoint(ended):
+                    continue
+                if not running <= requests.keys():
+                    changed.get()
+                    continue
                 if failure is not None:
                     raise failure
-                # if a function has ended, another function starts first, and its request joins this batch
-                if running.isdisjoint(ended):
-                    numbers = sorted(running)
-                    answers.update(zip(numbers, answer([requests[k] for k in numbers]), strict=True))
-                    requests.clear()
+                numbers = sorted(running)
+                answers.update(zip(numbers, answer([requests[k] for k in numbers]), strict=True))
+                requests.clear()
             except BaseException as error:
                 failure = error
                 answers.update(dict.fromkeys(requests, failure))
                 requests.clear()
-            condition.notify_all()
+    finally:
+        for _ in range(min(width, len(functions))):
+            waiting.put(None)
     if failure is not None:
         raise failure
