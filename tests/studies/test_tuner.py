@@ -46,8 +46,11 @@ def test_search_is_repeated_if_held_out_trials_break_a_limit(small):
     """The largest torque of two training and two screened trials is smaller than that of 60 held-out trials."""
     text = SHORT_CHAIN.replace("peak_torque = 3.0", f"peak_torque = {LIMIT}").replace("trials = 8", "trials = 2")
     loaded = scenario.from_tables(tomllib.loads(text))
-    found = tuner.tune(loaded, 0, with_checks=False)
+    steps = list[str]()
+    found = tuner.tune(loaded, 0, lambda step, *_: steps.append(step), with_checks=False)
     first, second = found.earlier
+    for number in (2, 3):
+        assert any(step.startswith(f"search {number} of at most 3: ") and "peak_torque" in step for step in steps)
     assert found.met
     seeds = [one.held_out_seed for one in (first, second, found)]
     assert seeds == [

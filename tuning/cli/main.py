@@ -207,8 +207,8 @@ def tune(
 ) -> int:
     """Find the gains with the smallest error after t_f that meet every requirement, and verify them on held-out trials.
 
-    Ctrl-C ends the search and verifies the best gains so far; a second Ctrl-C kills it. In both cases, the same command
-    resumes the search.
+    Ctrl-C ends the search and verifies the best gains so far. A second Ctrl-C, or one after the search, stops without a
+    result. In each case, the same command resumes.
 
     Exit status: 0 every requirement met on the held-out trials, 1 not met, 2 configuration error, 130 interrupted.
 

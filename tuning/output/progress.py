@@ -89,7 +89,7 @@ class Progress(Bar):
         """Report the current step, the number of steps done and in all, the best objective, and its violation."""
         if (total or None) != self._bar.tasks[0].total:
             self._bar.reset(self._task, total=total or None)
-        limits = "limits met" if violation == 0.0 else f"{format_ratio(100.0 * violation)} % beyond a limit"
+        limits = "limits met in training" if violation == 0.0 else f"{format_ratio(100.0 * violation)} % beyond a limit"
         best = f": {format_objective(self._objective, value, self._plant)}, {limits}" if value == value else ""
         self._bar.update(self._task, completed=done)
         self._step, self._count = step + best, f", {done} of {total}" if total else ""

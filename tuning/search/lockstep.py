@@ -30,8 +30,8 @@ def run_in_lockstep(
         BaseException: The exception of a function or of `answer`. An exception of `answer`, such as KeyboardInterrupt,
             is first raised inside the functions that wait.
     """
-    # Queues only wake threads that wait; the dictionaries hold the state. Waiting for a `SimpleQueue` can be interrupted
-    # safely, unlike waiting for a `threading.Condition`.
+    # Queues only wake waiting threads, the state is in the dictionaries. Unlike waiting for a `threading.Condition`,
+    # waiting for a `SimpleQueue` can be interrupted safely.
     requests, answers = dict[int, Any](), dict[int, Any]()  # of the functions that wait, by their numbers
     ended = dict[int, BaseException | None]()  # exceptions of the functions that have ended
     changed, woken = SimpleQueue[None](), [SimpleQueue[None]() for _ in functions]

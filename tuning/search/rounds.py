@@ -139,7 +139,7 @@ class Rounds:
             announce: is called with the name of the step.
         """
         if self._on_every_trial and self.hardest is None:
-            announce("looking for the worst case")
+            announce("worst case of the gains found")
             self.hardest = worst_case.find_hardest(self.problem, self._on_every_trial, gains, self._screening)
 
     def _screen(self, gains: np.ndarray) -> worst_case.Screened:

@@ -25,7 +25,7 @@ from tuning.search.journal import Journal
 from tuning.search.local_searches import Step
 from tuning.search.objective import T_F
 from tuning.search.optimise import Search
-from tuning.search.progress import Report
+from tuning.search.progress import Report, headed
 from tuning.search.trust import Profile
 from tuning.studies import judging, posing, stability
 from tuning.studies.posing import TuningSetup
@@ -204,7 +204,7 @@ def _search_and_judge(
         setup.problem, setup.scenario_gains, starts, report=report, prepare=partial(_compile_judging, scenario)
     )
     outcome, setup = _search_in_wider_bounds(outcome, setup, journal, report)
-    search_again = partial(setup.search, setup.problem, report=report)
+    search_again = partial(setup.search, setup.problem)
     earlier = list[RejectedSearch]()
     while True:
         report("verifying on held-out trials", 0, 0, outcome.value, outcome.violation)
@@ -219,7 +219,17 @@ def _search_and_judge(
         earlier.append(RejectedSearch(held_out_seed, rounded, outcome.margins, broken_ratios))
         reached = dict(zip(outcome.problem.rows, outcome.worst, strict=True))  # value over limit on the training trials
         margins = {name: 1.0 - float(reached[name]) / (EXTRA_DISTANCE * broken_ratios[name]) for name in broken_ratios}
-        repeated = search_again(outcome.gains, starts, margins=outcome.margins | margins)
+        heading = f"search {len(earlier) + 1} of at most {tries}"
+        broken = (
+            f"{heading}: held-out trials broke {', '.join(broken_ratios)}, so it keeps more distance from the limit"
+        )
+        report(broken, 0, 0, outcome.value, outcome.violation)
+        repeated = search_again(
+            outcome.gains,
+            starts,
+            margins=outcome.margins | margins,
+            report=headed(report, heading),
+        )
         outcome = replace(repeated, history=[*outcome.history, *_renumber_starts(outcome.history, repeated.history)])
 
 
