@@ -220,16 +220,10 @@ def _search_and_judge(
         reached = dict(zip(outcome.problem.rows, outcome.worst, strict=True))  # value over limit on the training trials
         margins = {name: 1.0 - float(reached[name]) / (EXTRA_DISTANCE * broken_ratios[name]) for name in broken_ratios}
         heading = f"search {len(earlier) + 1} of at most {tries}"
-        broken = (
-            f"{heading}: held-out trials broke {', '.join(broken_ratios)}, so it keeps more distance from the limit"
-        )
-        report(broken, 0, 0, outcome.value, outcome.violation)
-        repeated = search_again(
-            outcome.gains,
-            starts,
-            margins=outcome.margins | margins,
-            report=headed(report, heading),
-        )
+        reason = f"held-out trials broke {', '.join(broken_ratios)}, so it keeps more distance from the limit"
+        report(f"{heading}: {reason}", 0, 0, outcome.value, outcome.violation)
+        margins = outcome.margins | margins
+        repeated = search_again(outcome.gains, starts, margins=margins, report=headed(report, heading))
         outcome = replace(repeated, history=[*outcome.history, *_renumber_starts(outcome.history, repeated.history)])
 
 
