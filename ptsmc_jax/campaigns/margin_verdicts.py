@@ -39,7 +39,9 @@ def judge_loop(parts: Parts, required: Sequence[Requirement]) -> list[Verdict]:
 
     There are no margins if the nominal run does not come to rest, see `limit_cycles`.
     """
-    return _verdicts(required, run_margins.judge_run(parts)[0].worst()) if required else []
+    if not required:
+        return []
+    return _verdicts(required, run_margins.judge_run(parts, with_delay=_with_delay(required))[0].worst())
 
 
 def judge_trials(ready: Study, seed: int, rows: np.ndarray | Row | None = None) -> list[Verdict]:
@@ -64,10 +66,15 @@ def prepare(ready: Study, rows: np.ndarray | Row | None = None) -> None:
     """Start to compile the programs of `judge_trials` in the background."""
     trials = _select_trials(ready, rows)
     if trials is not None:
-        with_delay = any(requirement.metric == DELAY for requirement in ready.margins)
-        _loops_and_margins.prepare(*_arguments(ready.parts, ready.dispersion, 0, trials, with_delay))
+        arguments = _arguments(ready.parts, ready.dispersion, 0, trials, _with_delay(ready.margins))
+        _loops_and_margins.prepare(*arguments)
     elif ready.margins:
-        run_margins.judged_margins.prepare(ready.parts)
+        run_margins.judged_margins.prepare(ready.parts, _with_delay(ready.margins))
+
+
+def _with_delay(required: Sequence[Requirement]) -> bool:
+    """Return whether the delay margin is required."""
+    return any(requirement.metric == DELAY for requirement in required)
 
 
 def _select_trials(ready: Study, rows: np.ndarray | Row | None) -> np.ndarray | Row | None:

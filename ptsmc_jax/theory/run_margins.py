@@ -137,25 +137,35 @@ def judged_loops(parts: Parts, run: linear.NominalRun, *, fractional_delays: boo
     return loops, run.period.now.hold[indices]
 
 
-@programs.jit(compiler_options=programs.FAST_COMPILE, title="the margins of the nominal run")
-def judged_margins(parts: Parts) -> tuple[Margins, Array, History]:
+@programs.jit(
+    static_argnames="with_delay", compiler_options=programs.FAST_COMPILE, title="the margins of the nominal run"
+)
+def judged_margins(parts: Parts, with_delay: bool = True) -> tuple[Margins, Array, History]:
     """Return the margins at the `judged_times` and in the hold phase, and the commands of the nominal run.
 
     The margins are (times + 1, m). The second result marks the entries in the hold phase, (times + 1,) bool. The
     function supports all JAX transformations.
+
+    Args:
+        parts: the sampled scenario.
+        with_delay: whether to compute the delay margin; otherwise it is NaN.
     """
     run = linear.simulate_nominal(parts)
-    loops, hold = judged_loops(parts, run)
-    return margins.compute_each(loops), hold, command_history(parts, run)
+    loops, hold = judged_loops(parts, run, fractional_delays=with_delay)
+    return margins.compute_each(loops, with_delay=with_delay), hold, command_history(parts, run)
 
 
-def judge_run(parts: Parts) -> tuple[Margins, np.ndarray, limit_cycles.LimitCycle | None]:
+def judge_run(parts: Parts, *, with_delay: bool = True) -> tuple[Margins, np.ndarray, limit_cycles.LimitCycle | None]:
     """Return the margins at the `judged_times` and in the hold phase, and the limit cycle of the nominal run.
 
     The margins are (times + 1, m). The second result marks the entries in the hold phase, (times + 1,) bool. If
     there is a limit cycle, the margins in the hold phase are zero, see `limit_cycles`.
+
+    Args:
+        parts: the sampled scenario.
+        with_delay: whether to compute the delay margin, which takes half of the compilation; otherwise it is NaN.
     """
-    values, hold, commands = jax.tree.map(np.asarray, judged_margins(parts))
+    values, hold, commands = jax.tree.map(np.asarray, judged_margins(parts, with_delay))
     limit_cycle = limit_cycles.find(parts, commands)
     return limit_cycles.zero_margins(values, hold & (limit_cycle is not None)), hold, limit_cycle
 

@@ -385,4 +385,4 @@ def _compile_judging(scenario: Scenario) -> None:
     simulated = study(judging.on_flight_clock(scenario))
     montecarlo.prepare(simulated.parts, simulated.dispersion, judging.count_held_out_trials(simulated))
     if scenario.sampled:
-        run_margins.judged_margins.prepare(simulated.parts)
+        run_margins.judged_margins.prepare(simulated.parts, True)
