@@ -31,7 +31,11 @@ METRICS = ("window_error", "terminal_error", "peak_torque", "effort")  # metrics
 
 
 def drawn(seed):
-    """Return a random sampled scenario from `BUILT_IN`: one kind of each table, and some hardware and dispersions."""
+    """Return a random scenario with a sampled loop.
+
+    Each required table of `BUILT_IN` has a random kind, and so do some optional tables. [hardware] and [dispersion]
+    have random keys.
+    """
     chance = random.Random(seed)
     kind = chance.choice(["spacecraft", "spacecraft", "spacecraft", "chain"])
     tables = {}

@@ -55,7 +55,7 @@ class BatchedArray:
 
     @classmethod
     def of_components(cls, components: np.ndarray, axes: int = TRIAL) -> "BatchedArray":
-        """Return the array of these components, an object array."""
+        """Return the array with these components, an object array of its shape, and with these batch axes."""
         return cls(components.shape, tuple(components.flat), axes=axes)
 
     @property
@@ -216,7 +216,7 @@ def _identity(part: Any) -> Any:
 
 
 def _has_tangent(values: Sequence[BatchedArray]) -> bool:
-    """Return whether a value is a tangent. Components of tangents may be constant zeros, which are skipped."""
+    """Return whether any value is a tangent, which differs by direction. Rules then skip constant zeros."""
     return any(value.axes & DIRECTION for value in values)
 
 
@@ -241,7 +241,7 @@ _ZERO_RULES: dict[str, Callable] = {
 
 
 def pick_entries(eqn: Any, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return the results of a primitive that only moves entries, on object arrays."""
+    """Return the results of a primitive that only moves entries, such as `slice`, on object arrays of any entries."""
     shape, params, first = eqn.outvars[0].aval.shape, eqn.params, arrays[0]
     match eqn.primitive.name:
         case "reshape" if params.get("dimensions") is None:

@@ -123,12 +123,14 @@ def union(flags: Sequence[int]) -> int:
 
 
 def dependence(jaxpr: core.Jaxpr, inputs: Sequence[int]) -> list[int]:
-    """Return the flags of a jaxpr's outputs, given the flags of its inputs: the union of all that they depend on."""
+    """Return the flags of each output of a jaxpr: the union of the flags of the inputs that it depends on."""
     return interpret(jaxpr, [0] * len(jaxpr.constvars), inputs, lambda _: 0, _propagate)
 
 
 def scan_dependence(body: core.Jaxpr, consts: Sequence[int], init: Sequence[int], xs: Sequence[int]) -> list[int]:
-    """Return the flags of the carries and of the stacked outputs of a scan, the fixed point over its steps.
+    """Return the flags of the last carries of a scan, then the flags of its stacked outputs.
+
+    The flags of the carries are propagated through the step until they no longer change.
 
     Args:
         body: jaxpr of a step.

@@ -138,7 +138,7 @@ class _StoredArray(NamedTuple):
     Args:
         kind: dtype of the table.
         start: index of the first entry.
-        stride: distance from direction to direction, 0 if there is only one array.
+        stride: entries from one direction of differentiation to the next, 0 if all directions have the same array.
         shape: shape of the array.
         dtype: dtype of the array.
         table: the table, in the kernel.
@@ -152,7 +152,10 @@ class _StoredArray(NamedTuple):
     table: Any = None
 
     def in_tables(self, tables: dict[str, Any]) -> "_StoredArray":
-        """Return the array bound to the tables of each dtype, at the direction of `jvp` of this kernel instance."""
+        """Return the array with the table that `load` reads, at the direction of this kernel instance.
+
+        tables: the table of each dtype.
+        """
         start = np.int32(self.start)
         if self.stride:
             start = start + pl.program_id(1) * np.int32(self.stride)
@@ -178,7 +181,15 @@ class _Tables:
         self.sizes: dict[str, int] = {}
 
     def add(self, parts: Sequence, size: int, shape: tuple[int, ...], dtype: Any, stride: int = 0) -> _StoredArray:
-        """Append the `size` entries of an array and return its place. A table without entries is not created."""
+        """Append an array to the table of its dtype, and return its place there. An empty array creates no table.
+
+        Args:
+            parts: the entries: one array of numbers, or a row for each component. Empty: the places are only reserved.
+            size: number of entries.
+            shape: shape of the array.
+            dtype: dtype of the array.
+            stride: see `_StoredArray`.
+        """
         kind = _table_dtype(dtype)
         start = self.sizes.get(kind, 0)
         if size:
@@ -198,12 +209,19 @@ class _Tables:
         return self.add([array], array.size, value.shape, dtype, math.prod(value.shape) if value.axes else 0)
 
     def number_arrays(self) -> list[Array]:
-        """Return a table (length,) for each dtype."""
+        """Return the table of numbers of each dtype, padded to a power of two that is at least 16."""
         whole = [jnp.concatenate(parts) for parts in self.parts.values()]
         return [jnp.pad(v, (0, max(16, _next_power_of_two(v.size)) - v.size)) for v in whole]
 
     def row_arrays(self, batch: tuple[int, ...], width: int) -> list[Array]:
-        """Return a table (directions * height, width) for each dtype."""
+        """Return the table of rows of each dtype, (directions * height, width).
+
+        The rows of a direction are padded to a power of two, the height.
+
+        Args:
+            batch: (trials,) or (directions, trials).
+            width: length of a row. A row over fewer trials is padded.
+        """
         arrays = []
         for kind, parts in self.parts.items():
             stacked = jnp.stack([jnp.broadcast_to(part, batch).astype(kind) for part in parts], axis=-2)

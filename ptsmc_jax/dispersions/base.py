@@ -92,7 +92,7 @@ class Quantity(NamedTuple):
         Args:
             parts: nominal parts.
             random: random numbers of the quantity, (count,) [SI units or -].
-            distribution: name of the distribution of the random numbers.
+            distribution: name of the distribution of the random numbers, which selects the function of `combine`.
         """
         combine = self.combine if callable(self.combine) else self.combine[distribution]
         return self.write(parts, combine(random, self.read(parts), parts))
@@ -146,7 +146,7 @@ def validator(is_valid: Callable[[np.ndarray], np.ndarray], allowed: str) -> Val
     """
 
     def validate(rows: np.ndarray) -> np.ndarray:
-        """Return the rows (rows, n) [SI units] unchanged. Raise UnfitError if a row is invalid."""
+        """Return the rows (rows, n) [SI units] unchanged. Raise UnfitError if `is_valid` is false for a row."""
         UnfitError.check(np.asarray(is_valid(rows).reshape(len(rows), -1).all(axis=1)), lambda row: allowed)
         return rows
 

@@ -47,7 +47,7 @@ _STANDARD = {
 @pytree
 @dataclass(frozen=True)
 class RandomNumbers:
-    """Independent random numbers (n,).
+    """The distribution of independent random numbers (n,).
 
     Attributes:
         distribution: name of the standard distribution.
@@ -79,12 +79,12 @@ class RandomNumbers:
 
 
 def interval(low: object, high: object) -> RandomNumbers:
-    """Return random numbers that are uniform between low and high, (n,) each, in any unit."""
+    """Return the distribution of numbers that are uniform between low and high, (n,) each, in any unit."""
     return RandomNumbers("interval", vector(high) - vector(low), vector(low))
 
 
 def axis_angle(smallest: float, largest: float) -> RandomNumbers:
-    """Return random rotations by a uniform angle [rad] about an axis that is uniform on the sphere.
+    """Return the distribution of rotations by a uniform angle [rad] about an axis that is uniform on the sphere.
 
     The numbers are the z component [-] and azimuth [rad] of the axis, and the angle.
     """
@@ -92,7 +92,7 @@ def axis_angle(smallest: float, largest: float) -> RandomNumbers:
 
 
 def any_attitude() -> RandomNumbers:
-    """Return random attitudes that are uniform on SO(3)."""
+    """Return the distribution of attitudes that are uniform on SO(3)."""
     return RandomNumbers("any_attitude", vector(np.ones(4)))
 
 
@@ -133,7 +133,10 @@ def rotate_about_axis(random: Random, nominal: Numbers, parts: Any) -> Numbers:
 
 
 def rotate_from_reference(random: Random, nominal: Numbers, parts: Any) -> Numbers:
-    """Return the attitude (4,) [-] of the reference at t = 0, rotated as by `rotate_about_axis`."""
+    """Return the reference attitude (4,) [-] at t = 0 rotated about a random axis; `nominal` is not used.
+
+    random: see `axis_angle` [-, rad, rad].
+    """
     return rotate_about_axis(random, parts.reference(jnp.zeros_like(parts.t_end)).q, parts)
 
 
@@ -166,7 +169,12 @@ class RelativeInertia:
         errors, accepted = jax.tree.map(lambda *both: jnp.concatenate(both), candidates, slender)
 
         def find_first(found: tuple[Array, Array], candidate: tuple[Array, Array]) -> tuple[tuple[Array, Array], None]:
-            """Return whether a physical sample has been found, and the moments of the first one."""
+            """Return whether a physical sample has been found, and its principal moments; the nominal ones if not.
+
+            Args:
+                found: the result for the candidates before.
+                candidate: standardised errors (3,) of the moments, and whether the candidate is accepted.
+            """
             (is_found, moments), (error, is_accepted) = found, candidate
             sample = self.moments * (1.0 + self.std * error)
             is_physical = (2.0 * jnp.max(sample) <= jnp.sum(sample)) & (jnp.min(sample) > 0.0)

@@ -54,7 +54,7 @@ _PAIR_INDICES = [[PAIRS.index((min(i, j), max(i, j))) for j in range(3)] for i i
 
 
 def level_name(name: str) -> str:
-    """Return the name of the quantity that is one common random factor on all components: `torque_limit_level`."""
+    """Return the name of the quantity whose numbers have a common random factor, such as `torque_limit_level`."""
     return f"{name}_level"
 
 
@@ -99,7 +99,10 @@ def _count_modes(parts: Parts) -> int:
 
 
 def _check_flexible_body(table: TableValues, parts: Parts) -> None:
-    """Check that inertia and coupling of each row, or the nominal ones, belong to a physical flexible body."""
+    """Raise UnfitError if J - D'D is not positive definite for the inertia J and the mode coupling D of a row.
+
+    The nominal J or D is used if the run table does not give it. A rigid body is not checked.
+    """
     if not _count_modes(parts):
         return
     body, count = paths.get(parts, "plant"), len(next(iter(table.values())))
@@ -143,13 +146,13 @@ def _count_channels(parts: Parts) -> int:
 
 
 def _read_directions(parts: Parts) -> Numbers:
-    """Return the true directions of the channels, one after another, (3 channels,) [-]."""
+    """Return the true directions of the actuator channels, one after another, (3 channels,) [-]."""
     directions = parts.actuators.directions
     return jnp.ravel((channel_directions(parts) if directions is None else directions).T)
 
 
 def _rotate_channels(random: Random, nominal: Numbers, parts: Parts) -> Numbers:
-    """Return the nominal directions (3 channels,) [-], each rotated by its rotation vector [rad]."""
+    """Return the nominal directions of the channels (3 channels,) [-], each rotated by its rotation vector [rad]."""
     turns, axes = random.reshape(-1, 3), nominal.reshape(-1, 3)
     rotated = [attitude.rotate(attitude.from_rotation_vector(turns[k]), axes[k]) for k in range(axes.shape[0])]
     return jnp.concatenate(rotated)
@@ -332,9 +335,9 @@ def read_columns(parts: Parts, names: Iterable[str]) -> dict[str, Array]:
 
 
 def units(parts: Parts) -> dict[str, str]:
-    """Return the units, such as "rad" or "-", of all columns of these parts, and of `initial_angle`.
+    """Return the unit of each column of these parts and of `initial_angle`, such as "rad" or "-", by column.
 
-    A unit is empty if the plant has units of its own.
+    For a plant with custom units, the units of all quantities except angles, times and ratios are empty.
     """
     unit_of = {"initial_angle": parts.controller.kinematics.angle_unit}
     for quantity in QUANTITIES.values():

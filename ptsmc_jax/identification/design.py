@@ -37,7 +37,7 @@ class Design:
     undetermined: list[str]
 
     def table(self) -> pl.DataFrame:
-        """Return a row for each number: value, expected 1 sigma, 1 sigma after plain slews, unit."""
+        """Return a row for each number: value, expected 1 sigma, 1 sigma after one slew about each axis, unit."""
         numbers = self.problem.numbers(np.zeros(self.problem.size))
         return pl.DataFrame({
             "parameter": self.problem.labels, "value": numbers, "expected_std": self.std, "plain_std": self.plain_std,
@@ -167,7 +167,13 @@ def _log_at_rest(loaded: Any, t: np.ndarray) -> Measurements:
 
 
 def _predict_readings(problem: Problem, search: Search, log: Measurements) -> Measurements:
-    """Return the log with the readings that the model predicts without noise."""
+    """Return the log with readings without noise, predicted from the first row with the scenario's parameters.
+
+    Args:
+        problem: the model and its parameters.
+        search: runs the filter, without readings after the first row.
+        log: times, commands, first readings, and which readings exist.
+    """
     rows, kind = estimation.prepare_log(problem, log)
     without_readings = rows._replace(valid=np.concatenate([rows.valid[:1], np.zeros_like(rows.valid[1:])]))
     _, track = search.run_filter(np.zeros(problem.size), (without_readings, kind))

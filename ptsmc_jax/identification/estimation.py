@@ -49,8 +49,9 @@ PreparedLog = tuple[Rows, LogKind]  # a log for the filter
 class Fit:
     """Innovations of a log for estimated parameters.
 
-    The estimates have errors that change the predictions of a validation log. `adjusted` are its innovations for the
-    most likely parameters within the uncertainty of the estimates, and `distance` is their distance from the estimates.
+    The estimates have errors that change the predictions of a validation log. A validation log therefore also has
+    adjusted parameters, computed by one Newton step. They are the most likely parameters for this log, with the
+    estimates and their covariance as the prior. `adjusted` are the innovations for the adjusted parameters.
     """
 
     log: Measurements
@@ -58,11 +59,14 @@ class Fit:
     innovations: Innovations  # arrays (rows - 1, components)
     track: FilterState  # estimates at each row but the first
     adjusted: Innovations | None = None
-    distance: float = 0.0  # distance of this log's own most likely parameters from the estimates, RMS in sigmas
+    distance: float = 0.0  # distance of the adjusted parameters from the estimates, RMS in sigmas of the estimates
 
     @property
     def whitened(self) -> np.ndarray:
-        """Innovations over their 1 sigma, (samples, components) [-], NaN without a reading; `adjusted` if given."""
+        """Innovations over their 1 sigma, (samples, components) [-]; `adjusted` if given.
+
+        They are NaN for missing readings and for outliers.
+        """
         value, variance, accepted = self.innovations if self.adjusted is None else self.adjusted
         sampled = self.rows.log_row[1:] >= 0
         return np.where(accepted, value / np.sqrt(variance), np.nan)[sampled]
@@ -100,7 +104,8 @@ class Fit:
     def is_white(self) -> bool:
         """Whether the innovations fit their variance and are uncorrelated in time.
 
-        About 1 % of logs fail even with a correct model, because LAGS autocorrelations of each component are tested.
+        The adjusted parameters of a validation log must also be near the estimates, see `MAX_DISTANCE`. About 1 % of
+        logs fail even with a correct model, because LAGS autocorrelations of each component are tested.
         """
         readings = np.maximum(np.sum(np.isfinite(self.whitened), axis=0), 1)
         bound = np.maximum(MAX_AUTOCORRELATION, MISFIT_SIGMAS / np.sqrt(readings))
@@ -112,9 +117,9 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class Identification:
-    """Estimated parameters of a scenario."""
+    """Estimated parameters of a scenario, with the fit of each log."""
 
-    scenario: Scenario
+    scenario: Scenario  # the scenario before the identification
     problem: Problem
     z: np.ndarray  # estimated coordinates (n,)
     start: np.ndarray  # numbers of the scenario (k,)
@@ -123,11 +128,11 @@ class Identification:
     covariance: np.ndarray  # covariance of the estimated numbers (k, k)
     undetermined: list[str]  # sentences on combinations that the data do not determine
     is_determined: bool  # whether data and prior knowledge together determine every parameter
-    fits: list[Fit]
-    validation: list[Fit]
-    converged: bool
-    steps: int
-    log_likelihood: float
+    fits: list[Fit]  # fits of the logs
+    validation: list[Fit]  # fits of the validation logs
+    converged: bool  # whether the search that ended at z converged
+    steps: int  # number of steps of this search
+    log_likelihood: float  # with the prior
 
     @property
     def std(self) -> np.ndarray:
@@ -212,9 +217,9 @@ def innovation_gate(rate: float) -> float:
 class SearchResult(NamedTuple):
     """Result of a local search."""
 
-    z: np.ndarray
+    z: np.ndarray  # coordinates (n,) at the end of the search
     log_likelihood: float  # with the prior
-    information: np.ndarray
+    information: np.ndarray  # Fisher information (n, n), with the prior
     mean_square: float  # of the innovations, relative to their variance
     converged: bool
     steps: int
@@ -224,7 +229,7 @@ class Search:
     """Local searches for the most likely parameters of some logs. Logs of the same length share compiled programs."""
 
     def __init__(self, problem: Problem, logs: Sequence[PreparedLog], gate: float, report: Callable[[str], None]):
-        """Args: problem, logs, mean normalised square above which readings are outliers, and progress function."""
+        """Args: problem, logs, progress function; gate: mean normalised square above which readings are outliers."""
         self.problem, self.logs, self.gate, self.report = problem, list(logs), gate, report
         self.prior_weight = problem.has_prior().astype(float)
         self._noise_is_free = any(parameter.name.endswith("_noise") for parameter in problem.parameters)
@@ -380,7 +385,13 @@ class Search:
         return rows._replace(valid=np.concatenate([rows.valid[:1], innovations.accepted])), kind
 
     def maximise_likelihood(self, z: np.ndarray, logs: Sequence[PreparedLog], tolerance: float) -> SearchResult:
-        """Return the nearest maximum of the likelihood of these logs; it ends after a step below `tolerance` sigma."""
+        """Return the result of a local search from z for the most likely parameters of these logs and the prior.
+
+        Args:
+            z: starting point (n,).
+            logs: the logs, without outliers.
+            tolerance: length of a step that ends the search, in sigmas of the estimates.
+        """
         exact = tolerance <= STEP_TOLERANCE or self._noise_is_free
         value, gradient, information, mean_square = start = self.derivatives(z, logs, exact=exact)
         if not _is_finite(start):  # such as an inertia that is too small for the modes, after a random start
@@ -415,7 +426,7 @@ def _is_finite(derivatives: tuple[float, np.ndarray, np.ndarray, float]) -> bool
 
 
 def _to_jax(rows: Rows) -> Rows:
-    """Return the rows as arrays for JAX; `log_row` is not used there."""
+    """Return the rows as JAX arrays, with an empty `log_row`, which the filter does not use."""
     return jax.tree.map(jnp.asarray, rows._replace(log_row=np.zeros(0)))
 
 
@@ -428,9 +439,12 @@ def covariance(information: np.ndarray) -> np.ndarray:
 def describe_undetermined(problem: Problem, information: np.ndarray, by_z: np.ndarray) -> list[str]:
     """Return a sentence for each combination of parameters that the data do not determine.
 
+    These are the eigenvectors of the information with an eigenvalue below 1: their 1 sigma from the data alone is
+    larger than the 1 sigma of the prior.
+
     Args:
         problem: the problem.
-        information: Fisher information (n, n) of the data alone, in sigmas of the prior.
+        information: Fisher information (n, n) of the data alone, for coordinates in sigmas of the prior.
         by_z: derivatives of the numbers (k, n) by the coordinates.
     """
     sizes, directions = np.linalg.eigh(information)

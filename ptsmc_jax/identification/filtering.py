@@ -254,7 +254,17 @@ def _rotation_matrix(rotation_vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
 def _predict(
     model: Model, carry: FilterState, t: Scalar, dt: Scalar, command: Array, acting: Array, kind: LogKind
 ) -> FilterState:
-    """Return the state of the filter predicted for the end of an interval, before the readings there."""
+    """Return the filter predicted for the end of an interval, before it is corrected by the readings there.
+
+    Args:
+        model: the model.
+        carry: the filter at the start of the interval.
+        t: start of the interval [s].
+        dt: length of the interval [s].
+        command: entry of `Rows.command` at the start, used only if the log has wheel speeds.
+        acting: mean of the delayed command over the interval, see `acting_command`.
+        kind: structure of the log.
+    """
     plant, actuators = model.plant, model.actuators
     if kind.wheel_inertia is not None:  # the wheels' momentum is measured
         scale = 1.0 if actuators.scale is None else actuators.scale
@@ -352,7 +362,12 @@ def _correct(
 
 
 def _compute_residuals(model: Model, carry: FilterState, readings: dict[str, Array]) -> tuple[Array, Array, Array]:
-    """Return readings minus predictions (m,), their derivatives by the state of the filter (m, n), and their noise."""
+    """Compare the readings with their predictions.
+
+    Returns:
+        Readings minus predictions (m,), the derivatives of the predictions by the state of the filter (m, n), and the
+        1 sigma of the noise of the readings (m,).
+    """
     n = carry.covariance.shape[0]
     if not model.is_spacecraft:
         predicted = model.plant.visible(carry.x)

@@ -471,9 +471,13 @@ def inertia_derivatives(inertia: np.ndarray) -> np.ndarray:
 
 
 def _raise_singular_values(factor: np.ndarray, size: float) -> np.ndarray:
-    """Return a factor of the prior covariance (n, n) with its singular values raised to at least 0.3 `size`.
+    """Return a factor of the prior covariance of the inertia's entries with singular values of at least 0.3 `size`.
 
     With equal moments of inertia the principal axes are arbitrary, and the factor would be singular.
+
+    Args:
+        factor: a factor of this covariance (6, 6) [kg m^2].
+        size: prior 1 sigma of the smallest principal moment [kg m^2].
     """
     u, s, vt = np.linalg.svd(factor)
     return (u * np.maximum(s, 0.3 * size)) @ vt

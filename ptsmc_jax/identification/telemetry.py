@@ -114,7 +114,7 @@ class _Table:
         return values
 
     def read_times(self, column: str) -> Values:
-        """Return the times (rows,) [s] from the first row on."""
+        """Return the times since the first row (rows,) [s]."""
         series = self.column(column)
         if series.dtype.is_temporal():
             counts = series.cast(pl.Datetime("ns")).dt.timestamp("ns")
@@ -130,7 +130,10 @@ class _Table:
         return t - t[0]
 
     def read_commands(self, columns: Sequence[str], unit: float) -> Values:
-        """Return commands; a blank cell holds the last value."""
+        """Return the commands (rows, columns) in SI units; a blank cell repeats the last value of its column.
+
+        Raises RefusedError for a blank cell in the first row.
+        """
         values = self.read_numbers(columns, unit)
         for k, column in enumerate(columns):
             self.check_rows(np.isnan(values[:1, k]), column, "a number in the first row")
@@ -140,7 +143,7 @@ class _Table:
 
 
 def _iso_to_seconds(cell: str | None) -> float:
-    """Return a date and time in ISO 8601 as seconds since 1970, NaN if it is none. Without a zone it is UTC."""
+    """Return a date and time in ISO 8601 as seconds since 1970. A time without a zone is UTC; another text is NaN."""
     try:
         moment = datetime.fromisoformat(cell or "")
     except ValueError:

@@ -2,7 +2,8 @@
 
 A quaternion is q = [q1, q2, q3, q4] = [v, q4], scalar last, with the Hamilton product. It rotates from body axes to
 inertial axes. The paper and SciPy use the same order. With the body rate w in body axes [rad/s], the kinematics are
-(1) and (3): v' = T(q) w / 2 and q4' = -v.w / 2 with T(q) = q4 I + [v]x. Start with `multiply` and `rotate`.
+equations (1) and (3) of the paper: v' = T(q) w / 2 and q4' = -v.w / 2 with T(q) = q4 I + [v]x. Start with `multiply`
+and `rotate`.
 
 Functions of several operations are jitted. A program that calls one of them many times traces it once.
 """
@@ -63,7 +64,7 @@ def rotate(q: Quaternion, y: Vector) -> Vector:
 
 @jax.jit
 def t_matrix(q: Quaternion) -> Float[Array, "3 3"]:
-    """Matrix T(q) of (3) [-]."""
+    """Matrix T(q) = q4 I + [v]x [-], equation (3) of the paper."""
     x, y, z, s = q
     return jnp.stack([jnp.stack([s, -z, y]), jnp.stack([z, s, -x]), jnp.stack([-y, x, s])])
 
@@ -81,7 +82,7 @@ def t_inverse_times(q: Quaternion, y: Vector) -> Vector:
 
 @jax.jit
 def derivative(q: Quaternion, w: Vector) -> Quaternion:
-    """Time derivative of q [1/s] at the body rate w [rad/s], by (1)."""
+    """Time derivative of q [1/s] at the body rate w [rad/s], by equation (1) of the paper."""
     return 0.5 * jnp.append(q[3] * w + cross(q[:3], w), -jnp.dot(q[:3], w))
 
 

@@ -143,7 +143,8 @@ def decay(a: Float[Array, "n n"], dt: Scalar, largest: Scalar | None = None) -> 
     Args:
         a: matrix A of the linear part m' = -A m + g [1/s].
         dt: length of the step [s].
-        largest: largest `row_norm` of A dt among the steps of a batch, see `phi_functions`.
+        largest: largest `row_norm` of A dt in a batch of steps, which then all use the same number of doublings, see
+            `phi_functions`. None: use the norm of this A dt.
     """
     halves = phi_functions(-a * dt / 2, 3, None if largest is None else largest / 2)
     half, phi_half, *_ = halves

@@ -57,9 +57,10 @@ def _format_value(value: Any, indent: str) -> str:
 def pytree(cls: _Class) -> _Class:
     """Register a dataclass as a pytree: fields are children, but fields with the metadata `static` are structure.
 
-    `jax.tree_util.register_dataclass` must not be used instead. Up to jaxlib 0.10.2, two of its classes compare equal
-    if their fields have the same structure. In about one process of thirty their hashes are equal as well, and `jit`
-    then runs the program of one class for the other. The decorator also sets `__repr__` to `listing`.
+    `jax.tree_util.register_dataclass` must not be used instead. Up to jaxlib 0.10.2, it gives two classes equal tree
+    structures if their fields have the same structure. In about one process of thirty the hashes of the two tree
+    structures are equal as well, and `jit` then runs the program of one class for the other. The decorator also sets
+    `__repr__` to `listing`, which prints each field on its own line.
     """
     static = tuple(f.name for f in fields(cls) if f.metadata.get("static"))
     names = tuple(f.name for f in fields(cls) if f.name not in static)

@@ -94,13 +94,13 @@ def _error_at_and_after_t_f(run: Run) -> tuple[float, float]:
 
 
 def _time_to_one_percent(run: Run) -> float:
-    """Return the time [s] after which the error stays below 1 % of the initial error."""
+    """Return the time [s] of the first sample from which on the error is at most 1 % of the initial error."""
     size = np.linalg.norm(run.log.error, axis=1)
     return float(run.log.t[np.flatnonzero(size > 0.01 * size[0])[-1] + 1])
 
 
 def _first_torque(run: Run) -> float:
-    """Return the largest component of the torque at t = 0 [N m]."""
+    """Return the largest absolute component of the torque at t = 0 [N m]."""
     return float(np.abs(run.log.u[0]).max())
 
 
@@ -264,15 +264,15 @@ def _check_stays_at_origin(cases: dict[str, Run]) -> Claim:
 
 @dataclass(frozen=True)
 class Measured:
-    """Measurements of a run with one observer and one sign function, sampled at 20 Hz, without noise."""
+    """Measurements of a run in a sampled loop at 20 Hz without noise, with one observer and one sign function."""
 
     observer: str
     sign: str
     chattering: float  # of the torque after t_f [N m/s]
-    estimate_settled: float  # when the estimate has settled, NaN if never [s]
+    estimate_settled: float  # time at which the estimate has settled, see `SETTLED`; NaN if never [s]
     estimate_error: float  # largest |d_hat - d|_2 after t_f [N m]
     settling_time: float  # of the attitude, NaN if never [s]
-    window_error: float  # [-]
+    window_error: float  # RMS attitude error in the window after t_f [-]
     peak_torque: float  # [N m]
     t: np.ndarray  # (time,) [s]
     error_history: np.ndarray  # (time,) |d_hat - d|_2 [N m]

@@ -216,7 +216,7 @@ def _show_sign_of_q4() -> Slip:
     printed = replace(law, kinematics=_Unaligned(law.model))
 
     def at_t_f(controller: PrescribedTime) -> tuple[float, float]:
-        """Return the norm of eps_1 and the angle to the reference [deg] at t_f."""
+        """Simulate this controller. Return the norm of the error eps_1 and the angle to the reference [deg] at t_f."""
         run = runs.simulate(replace(ready, parts=replace(ready.parts, controller=controller)))
         k = int(np.flatnonzero(run.log.t <= float(law.t_f))[-1])
         angle = attitude.angle(jnp.asarray(run.log.x.q[k]), jnp.asarray(run.log.reference.q[k]))

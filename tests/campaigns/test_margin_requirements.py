@@ -123,8 +123,11 @@ def _few_loops():
         yield
 
 
-def looked_at(parts, dispersion, seed, late):
-    """Return the loops (TRIALS, times, ..) of the first trials, and their interpolated margins."""
+def loops_and_margins(parts, dispersion, seed, late):
+    """Return the loops (TRIALS, times, ..) of the first trials, and their margins interpolated over frequency.
+
+    If `late` is set, the loops allow delays by a fraction of a period.
+    """
     arguments = margin_verdicts._arguments(parts, dispersion, seed, np.arange(TRIALS), late)
     every = margin_verdicts._loops_and_margins(*arguments)
     return jax.tree.map(lambda v: np.asarray(v)[:TRIALS], every)
@@ -135,7 +138,7 @@ def all_of(parts, dispersion, seed, late=False):
 
     If `late` is not set, the delay margin is the phase margin over the crossover frequency, without the hold.
     """
-    loops, _ = looked_at(parts, dispersion, seed, late)
+    loops, _ = loops_and_margins(parts, dispersion, seed, late)
     each = [margins.compute_each(jax.tree.map(lambda v, k=k: v[k], loops), with_delay=late) for k in range(TRIALS)]
     if not late:
         each = [one._replace(delay=np.deg2rad(one.phase) / one.crossover) for one in each]
@@ -257,7 +260,7 @@ def test_margin_gradients_with_dispersed_inertia_compile_if_delta_is_free():
     assert (done.returncode, done.stdout) == (0, "(1, 1, 30, 6)\n"), done.stderr[-2000:]
 
 
-def test_evaluator_appends_margins_of_the_hardest_trials(drawn, monkeypatch):
+def test_evaluator_appends_constraints_on_the_worst_margins_of_all_trials(drawn, monkeypatch):
     posed = drawn
     assert posed.problem.rows == ("peak_torque", "gain_margin", "peak_sensitivity")
     normalised = posed.evaluate.bounds.normalise(posed.scenario_gains)[None]
@@ -338,7 +341,7 @@ def test_worst_margins_are_exact_without_exact_margins_of_all_loops(drawn, facto
     posed = drawn
     parts, dispersion = changed(posed, factors), posed.ready.dispersion
     every = all_of(parts, dispersion, 3, late)
-    _, rough = looked_at(parts, dispersion, 3, late)
+    _, rough = loops_and_margins(parts, dispersion, 3, late)
     period = BODY["loop"]["period"]
     for name, values in every.items():
         some = np.isfinite(values)

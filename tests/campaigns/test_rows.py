@@ -1,3 +1,5 @@
+"""Part files with the trials of a campaign: order, overlaps, damage and keys."""
+
 import os
 from pathlib import Path
 
@@ -108,7 +110,7 @@ def test_a_key_is_the_same_in_every_process():
     assert KEY.hex() == "79ec63fbf7446be36358bada73ee7bbd0088b974470097e1ab1365364697ff48"
 
 
-def test_overlapping_parts_are_not_read_twice(kept):
+def test_trials_of_overlapping_parts_are_read_once(kept):
     long, _, after = kept.write(0, frame(0, 50)), kept.write(20, frame(20, 20)), kept.write(50, frame(50, 10))
     assert kept.parts() == ([long, after], [])
     assert rows.read(kept.parts()[0])["trial"].to_list() == list(range(60))

@@ -111,7 +111,7 @@ def test_earlier_result_needs_the_same_scenario_seed_and_command(tmp_path):
     assert store.read_previous_summary(tmp_path / "none", tables, TOLD) is None
 
 
-def test_unfinished_run_with_a_list_of_sensors_resumes(tmp_path):
+def test_unfinished_run_is_found_only_for_the_same_list_of_sensors(tmp_path):
     sensors = [{"kind": "star_tracker", "period": 0.25}, {"kind": "gyro"}]
     tables, folder = {"loop": {"period": 0.125}, "sensors": sensors}, tmp_path / "out"
     store.begin_run(folder, tables, TOLD, fresh=True)

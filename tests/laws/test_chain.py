@@ -262,7 +262,7 @@ def test_exact_chain_solves_the_equations_of_chain_and_law(n):
 
 
 @pytest.mark.parametrize("x0", short([[5.0, 3.0], [5.0, 3.0, 2.0]], [[5.0, 3.0, 2.0]]))
-def test_sampled_chain_converges_to_the_continuous_chain_with_order_1(x0):
+def test_window_error_of_a_sampled_chain_converges_with_order_1_in_the_period(x0):
     wave = disturbances.Sinusoid(*(vector([v]) for v in (0.01, 1.0, 0.0, 0.0)))
     changes = {"bound": 0.01, "disturbance": wave, "delta": 0.5, "sign_width": 0.05}
     truth = fly(chain_parts(x0, **changes, steps=(4000, 200))).metrics.window_error

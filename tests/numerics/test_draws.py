@@ -149,9 +149,10 @@ SENSORS = ("devices.sensors", "devices.sensor_suite")  # a run has one of the tw
 
 
 def stream_names():
-    """Return the stream names that the source passes to functions of `draws`; constants of a module are resolved.
+    """Return a list of the stream names in all calls of `draws`. A name that two calls use is in the list twice.
 
-    The export has the streams of the simulation, whose numbers its plant must repeat.
+    Names in the two modules of sensors count once. The export is left out, because it must use the streams of the
+    simulation.
     """
     found = {module: module_stream_names(module, path) for module, path in modules().items() if "onboard" not in module}
     sensors = {name for module, names in found.items() if module.endswith(SENSORS) for name in names}
@@ -160,7 +161,7 @@ def stream_names():
 
 
 def module_stream_names(module, path):
-    """Return the stream names in one module."""
+    """Return the stream names in the calls of `draws` in one module, with the values of its constants."""
     source, names = path.read_text(), []
     if "draws." not in source:
         return names

@@ -132,7 +132,11 @@ def test_bound_for_unequal_gains_has_the_factor_root_of_their_condition_number()
 
 
 def test_bound_of_the_paper_is_violated_for_its_own_parameters():
-    """c/l_m without the factor sqrt(3) is less than the error for d' = (c, c, c) and a diagonal J."""
+    """The bound (55) of the estimation error tends to c / l_m, which lacks the factor sqrt(3).
+
+    c is the bound of each component of d', and l_m is the smallest eigenvalue of L J^-1. For d' = (c, c, c), the error
+    exceeds c / l_m.
+    """
     a = np.diag(10.0 / np.array(PAPER_INERTIA))
     error = np.linalg.norm(worst_error(a, np.ones(3), 1e-3, 100.0))
     assert error > 1e-3 / (10.0 / 14.0)

@@ -455,7 +455,7 @@ def test_chart_of_a_front_has_intervals_knee_limit_and_no_point_without_an_error
     assert "peak torque [N m]" in json.dumps(drawn["layout"])
 
 
-def test_chart_shows_the_smallest_lower_bound_and_a_required_limit():
+def test_comparison_chart_shows_the_smallest_lower_bound_of_the_error_and_a_required_limit():
     laws = [examples.law(lower_bound=lower_bound) for lower_bound in (2e-6, 1e-6, None)]
     asked = examples.law(verdicts=[examples.torque(0.9)])
     found = list(examples.compare({str(k): law for k, law in enumerate([*laws, asked])}).laws.values())

@@ -133,7 +133,7 @@ def changed(tables, path, value):
 
 
 def key_of(path):
-    """Return the key that an error names. For bounds it is the key of the interval."""
+    """Return the key that an error about the value at this path names. For any bound of a gain, it is `tune.bounds`."""
     key = ".".join(part for part in path if isinstance(part, str))
     return "tune.bounds" if key.startswith("tune.bounds") else key
 

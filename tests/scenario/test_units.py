@@ -158,7 +158,7 @@ def test_gains_of_every_law_scale_with_the_mission(law):
 
 
 def test_a_slew_of_ten_milliseconds_is_accepted():
-    """The run ends 3.3 ms after t_f instead of 10 s."""
+    """The default time from t_f to the end is t_f / 3: 3.3 ms here, and 10 s for t_f = 30 s."""
     quick = from_tables({"controller": {"t_f": 0.01}, "loop": {"mode": "sampled"}})
     assert quick.loop.t_end == pytest.approx(0.04 / 3.0)
     assert quick.loop.window == pytest.approx(0.01 / 30.0)

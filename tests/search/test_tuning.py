@@ -192,7 +192,7 @@ def problem(count=8, dispersion=SPREAD, may_break=None, **limits):
     return objective.problem(run, dispersion, 3, np.arange(count), WITHIN.names, wanted, may_break)
 
 
-def looked_at(some, *gains):
+def evaluated_at(some, *gains):
     """Return F, c and the logarithm of the objective at these gains, as `Evaluator` computes them."""
     found = Evaluator(WITHIN).measure(some, WITHIN.normalise(np.asarray(gains))[None])
     return found.f[0], found.c[0], found.value[0]
@@ -207,7 +207,7 @@ def test_measure_returns_the_rms_of_the_worst_trials_weighted_by_the_torque_and_
     some = replace(problem(peak_torque=0.7, effort=5.0), tail=3, torque_weight=0.3)
     simulated = simulated_at(some, np.arange(8), 3.0, 0.7)
     error, torque = (np.sqrt(np.mean(np.sort(v)[-3:] ** 2)) for v in (simulated.window_error, simulated.peak_torque))
-    for f, c, value in (measure(some, vector([3.0, 0.7])), looked_at(some, 3.0, 0.7)):
+    for f, c, value in (measure(some, vector([3.0, 0.7])), evaluated_at(some, 3.0, 0.7)):
         np.testing.assert_allclose(np.exp(value), error, rtol=1e-10)
         np.testing.assert_allclose(np.exp(f), error * torque**0.3, rtol=1e-10)
         np.testing.assert_allclose(c[0] + 1, simulated.peak_torque / 0.7, rtol=1e-10)
@@ -232,7 +232,7 @@ def test_a_quantile_limit_is_a_limit_on_an_order_statistic(least):
     """The largest c is an order statistic of the averaged trials. Added trials do not count in the quantile."""
     some = problem(may_break=8 - least, peak_torque=0.7, effort=5.0)
     some = objective.with_trials(some, np.arange(8, 11))  # they must keep the limits on every trial
-    f, c, _ = looked_at(some, 3.0, 0.7)
+    f, c, _ = evaluated_at(some, 3.0, 0.7)
     simulated = simulated_at(some, np.arange(11), 3.0, 0.7)
     np.testing.assert_allclose(np.exp(f), np.sqrt(np.mean(simulated.window_error[:8] ** 2)), rtol=1e-10)
     expected = np.sort(simulated.peak_torque[:8])[least - 1] / 0.7 - 1
@@ -361,7 +361,10 @@ def test_a_failed_trial_is_worse_than_any_violation(far):
 
 
 def test_search_agrees_with_a_brute_force_scan(monkeypatch):
-    """The scan covers the same problem, almost without screening for harder trials."""
+    """The scan simulates the trials of the search on a grid of both gains.
+
+    The search screens 16 other trials for harder ones instead of 4096.
+    """
     helpers.small_search(monkeypatch)
     monkeypatch.setattr(worst, "SCREENED", 16)
     monkeypatch.setattr(starts, "CANDIDATES", 64)
@@ -392,7 +395,7 @@ def test_search_agrees_with_a_brute_force_scan(monkeypatch):
     best = np.exp(scan.f[scan.largest_c <= -margin].min())  # with the tightened limit
     assert found.value <= best * 1.01
     assert found.worst[0] > 1.0 - 1.5 * margin  # the limit is active
-    f, c, _ = looked_at(found.problem, *found.gains)
+    f, c, _ = evaluated_at(found.problem, *found.gains)
     np.testing.assert_allclose(np.exp(f), found.value, rtol=1e-9)
     assert c.max() <= 0.0
 
@@ -464,7 +467,7 @@ def test_a_problem_with_fewer_trials_keeps_added_trials_and_fractions():
     fewer = objective.fewer_trials(some, 4)
     assert np.asarray(fewer.trials).tolist() == [0, 1, 2, 3, 8, 9, 10]
     assert (fewer.averaged, fewer.may_break, fewer.tail) == (4, (1, None, None), 1)
-    _, c, _ = looked_at(fewer, 3.0, 0.7)
+    _, c, _ = evaluated_at(fewer, 3.0, 0.7)
     simulated = simulated_at(some, np.r_[:4, 8:11], 3.0, 0.7)
     np.testing.assert_allclose(c[1] + 1, simulated.effort / 5.0, rtol=1e-10)
     np.testing.assert_allclose(c[0].max(), np.sort(simulated.peak_torque[:4])[2] / 0.7 - 1, rtol=1e-10)
@@ -520,7 +523,7 @@ def test_statistics_count_failures_and_cover_the_other_trials(monkeypatch):
 
 def test_the_objective_can_be_t_f_or_another_metric():
     some = problem()
-    f, _, value = looked_at(replace(some, objective="peak_torque", tail=1), 3.0, 0.7)
+    f, _, value = evaluated_at(replace(some, objective="peak_torque", tail=1), 3.0, 0.7)
     largest = simulated_at(some, np.arange(8), 3.0, 0.7).peak_torque.max()
     np.testing.assert_allclose(np.exp([f, value]), largest, rtol=1e-10)
     rules = replace(some, names=("eta", "t_f"), objective="t_f").rules

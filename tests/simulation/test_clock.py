@@ -1,3 +1,5 @@
+"""Clocks of the sampled loop: sample times, start of the hold phase, and derivatives by t_f and delta."""
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -124,7 +126,7 @@ def test_the_noise_of_a_partial_first_period_includes_noise_of_the_next_sample()
     np.testing.assert_allclose(ticks.noise_weight[first], 0.3, atol=1e-10)
 
 
-def test_the_flight_clock_starts_at_zero_and_hands_over_at_the_first_sample_from_t_s_on():
+def test_the_flight_clock_starts_at_zero_and_its_hold_phase_at_the_first_sample_from_t_f_minus_delta_on():
     flight = clock.flight_clock(0.1, 15.04)
     ticks = ticks_of(flight, vector(10.0), vector(1.07))
     np.testing.assert_allclose(ticks.t[:150], 0.1 * np.arange(150), rtol=1e-15)

@@ -76,10 +76,10 @@ def test_verdicts_print_angles_in_arcsec_and_rates_in_degrees_too():
 @pytest.mark.parametrize("confidence", [0.5, 0.9, 0.99])
 @pytest.mark.parametrize("trials", [10, 100, 1000, 5000])
 def test_a_fraction_is_demonstrated_by_the_exact_binomial_bound(quantile, confidence, trials):
-    """The binomial distribution defines the required number of trials within the limit.
+    """The test checks `must_keep`, the number of a campaign's trials that must keep a limit.
 
-    If the true fraction were only the quantile, at most 1 - confidence of all campaigns would reach this number. One
-    trial fewer would not suffice.
+    If the true fraction were equal to the quantile, at least this number of trials would keep the limit in at most
+    1 - confidence of all campaigns. For one trial fewer, this fraction of campaigns would be larger.
     """
     least = must_keep(trials, quantile, confidence)
     if least is None:

@@ -43,7 +43,10 @@ def small(monkeypatch):
 
 
 def test_search_is_repeated_if_held_out_trials_break_a_limit(small):
-    """The largest torque of two training and two screened trials is smaller than that of 60 held-out trials."""
+    """Two training and two screened trials keep the limit, but some of 60 held-out trials break it.
+
+    Each repeated search keeps more distance from the limit, and the third one meets it on the held-out trials.
+    """
     text = SHORT_CHAIN.replace("peak_torque = 3.0", f"peak_torque = {LIMIT}").replace("trials = 8", "trials = 2")
     loaded = scenario.from_tables(tomllib.loads(text))
     steps = list[str]()

@@ -247,8 +247,11 @@ TURNING = {
 }
 
 
-def test_loops_predict_the_deviation_of_a_neighbouring_run():
-    """The deviation includes the complete state and the delayed commands, at every sample around the hand-over."""
+def test_linearised_loops_predict_the_difference_of_two_close_runs():
+    """The difference includes the complete state and the delayed commands.
+
+    It is predicted at every sample around the hand-over from the approach phase to the hold phase.
+    """
     parts = scenario.study(scenario.from_tables(TURNING)).parts
     aside = parts.plant.retract(parts.initial, 1e-7 * jnp.asarray([1.0, -2.0, 1.5, 0.3, 0.2, -0.4]))
     run, other = (linear.simulate_nominal_jit(replace(parts, initial=x)) for x in (parts.initial, aside))

@@ -184,7 +184,7 @@ def charts(laws: dict[str, Law]) -> dict[str, list[Block]]:
 
 
 def reference_lines(question: Question, laws: list[Law]) -> dict[str, float]:
-    """Return the lines of a chart: the smallest lower bound of the laws, or a required limit."""
+    """Return the lines of a chart: the smallest lower bound of the error [arcsec] of all laws, or a required limit."""
     if question.judged:
         bounds = [bound for law in laws if (bound := _to_arcsec(law.lower_bound))]
         return {"lower bound": min(bounds)} if bounds else {}
