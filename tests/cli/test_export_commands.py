@@ -103,7 +103,7 @@ def test_campaign_runs_the_exported_controller_and_copies_it(command, tmp_path):
         command, tmp_path, *replay
     )
     code, out, err = command(*replay, "--trust")
-    assert (code, "equals its row to the last digit" in out, "same run up to round-off" in out) == (0, True, True)
+    assert (code, "equals its row to the last digit" in out, "equals the replayed trial" in out) == (0, True, True)
     assert err == f"ptsmc: runs {tmp_path / 'r' / 'controller'}, which --controller of r names\n"
     assert command("summarize", "r", "--no-figures", "--quiet")[0] == 0  # it does not execute the C code
     assert json.loads((tmp_path / "r" / "summary.json").read_text()) == told

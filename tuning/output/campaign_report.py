@@ -320,7 +320,7 @@ def replay_lines(difference: float | None, history_difference: float, tolerance:
         tolerance: the largest difference that counts as equal.
     """
     if difference is None:
-        yield "the campaign has no row of this trial yet"
+        yield "the campaign has no row of this trial yet to compare with"
     elif difference == 0.0:
         yield "the replayed trial equals its row to the last digit"
     elif difference <= tolerance:
@@ -329,7 +329,8 @@ def replay_lines(difference: float | None, history_difference: float, tolerance:
         found = _describe_difference(difference)
         yield f"the replayed trial does NOT equal its row: {found}; see versions and machine in versions.json"
     if history_difference <= ROUND_OFF:
-        yield f"the history is of the same run up to round-off: largest relative difference {history_difference:.0e}"
+        largest = f"largest relative difference {history_difference:.0e}"
+        yield f"the history equals the replayed trial up to round-off: {largest}"
     else:
         yield (
             f"another program simulates the history, and its metrics differ: "

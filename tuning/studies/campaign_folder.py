@@ -246,14 +246,19 @@ class Folder:
         """Return a function and its arguments. Another process calls it to rebuild the campaign and its rows."""
         return rebuild_campaign, (str(self.path.resolve()), self._checksum_key.hex())
 
-    def intact_parts(self) -> list[Part]:
-        """Return the parts of the rows. Raises RefusedError if a part is damaged, or if there are none."""
+    def stored_parts(self) -> list[Part]:
+        """Return the parts of the rows, if there are any. Raises RefusedError if a part is damaged."""
         parts, broken = self.rows.parts()
         if broken:
             raise RefusedError(
                 f"{broken[0]} is damaged or of another campaign; "
                 "`ptsmc montecarlo` with the same options simulates it again"
             )
+        return parts
+
+    def intact_parts(self) -> list[Part]:
+        """Return the parts of the rows. Raises RefusedError if a part is damaged, or if there are none."""
+        parts = self.stored_parts()
         if not parts:
             raise RefusedError(f"{self.path} contains no trials yet; `ptsmc montecarlo` simulates them")
         return parts

@@ -391,8 +391,11 @@ class Replay:
 
 
 def replay(folder: Folder, trial: int) -> Replay:
-    """Simulate a trial again: once as the campaign does, for its row, and once with its history."""
-    campaign = folder.campaign
+    """Simulate a trial again: once as the campaign does, for its row, and once with its history.
+
+    Raises RefusedError if a part of the rows is damaged.
+    """
+    parts, campaign = folder.stored_parts(), folder.campaign
     row_or_trial = trial if campaign.run_table is None else campaign.run_table.row(trial, folder.seed)
     run = runs.simulate(campaign.ready, folder.seed, row_or_trial, campaign.software)
     new_row = campaign.simulate([trial]).row(0, named=True)
@@ -400,7 +403,7 @@ def replay(folder: Folder, trial: int) -> Replay:
     if run.status != new_row["status"]:
         rounding = np.inf
     difference = None
-    for part in folder.rows.parts()[0]:
+    for part in parts:
         if part.first <= trial < part.end:
             row = rows.read([part]).filter(pl.col("trial") == trial).row(0, named=True)
             difference = max(_relative_difference(value, new_row[name]) for name, value in row.items())
