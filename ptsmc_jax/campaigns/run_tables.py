@@ -92,10 +92,14 @@ def read(path: Path, name: str = "--runs", allowed: str = ALLOWED) -> pl.DataFra
     files = sorted(path.glob("*.parquet")) if path.is_dir() else [path]
     if not files or files[0].suffix.lower() not in (".csv", ".parquet"):
         raise RefusedError(f"{name} is {path}, but must be {allowed}")
-    try:
-        return pl.concat([csv_tables.read_table(file) for file in files])
-    except (ValueError, pl.exceptions.PolarsError) as error:
-        raise RefusedError(f"{name} is {path}, which cannot be read: {str(error).splitlines()[0]}") from None
+    tables = list[pl.DataFrame]()
+    for file in files:
+        try:
+            tables = [pl.concat([*tables, csv_tables.read_table(file)])]
+        except (ValueError, pl.exceptions.PolarsError) as error:
+            damaged = "which" if file == path else f"whose {file.name}"
+            raise RefusedError(f"{name} is {path}, {damaged} cannot be read: {str(error).splitlines()[0]}") from None
+    return tables[0]
 
 
 def check_table(

@@ -492,3 +492,10 @@ def test_files_that_are_not_run_tables_are_refused(tmp_path):
             (tmp_path / name).mkdir()
         with refuses(RefusedError, said):
             run_tables.read(tmp_path / name)
+    pl.DataFrame({"trial": [1]}).write_parquet(tmp_path / "folder" / "1.parquet")
+    pl.DataFrame({"other": [1]}).write_parquet(tmp_path / "folder" / "2.parquet")
+    with refuses(RefusedError, "folder, whose 2.parquet cannot be read: "):
+        run_tables.read(tmp_path / "folder")
+    (tmp_path / "folder" / "1.parquet").write_bytes(b"PAR1")
+    with refuses(RefusedError, "folder, whose 1.parquet cannot be read: "):
+        run_tables.read(tmp_path / "folder")

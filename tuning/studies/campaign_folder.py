@@ -353,7 +353,7 @@ def open_folder(path: Path) -> Folder:
         checksums=checksums,
         trusted=False,
         table_name=stored.run_table,
-        table=None if stored.run_table is None else run_tables.read(path / TABLE),
+        table=None if stored.run_table is None else run_tables.read(path / TABLE, "the run table"),
         controller=path / C_FOLDER if custom.checksum_name(custom_parts.CONTROLLER) in checksums else None,
         first_look=stored.first_look,
     )
