@@ -210,18 +210,22 @@ def test_what_is_no_result_is_refused(command, simulated, tmp_path):
         assert refused(command, tmp_path, "report", folder).startswith(f"ptsmc: {said}; allowed is ")
     kept = tree(simulated)
     for name, content, said in (
-        ("summary.json", None, "run holds a simulate that is not finished; run the same command to its end"),
-        ("summary.json", "{", "run holds a file that cannot be read: "),
-        ("summary.json", "{}", "run holds a summary of another version (0.1.0): 'verdicts'; make it again"),
-        ("summary.json", '{"verdicts": 1}', "run holds a summary of another version (0.1.0): "),
-        ("summary.json", '{"verdicts": {}}', "run holds a summary of another version (0.1.0): "),
+        ("summary.json", None, "run/summary.json does not exist: "),
+        ("summary.json", "{", "run/summary.json is damaged or of another version: "),
+        ("summary.json", "[]", "run/summary.json is damaged or of another version: Expected `object`, got `array`; "),
+        ("summary.json", "{}", "run/summary.json is damaged or of another version: 'verdicts' is missing; "),
+        ("summary.json", '{"verdicts": 1}', "run/summary.json is damaged or of another version: "),
+        ("summary.json", '{"verdicts": {}}', "run/summary.json is damaged or of another version: "),
         ("versions.json", "[]", "run holds no result; allowed is a folder that a ptsmc command wrote"),
         ("versions.json", '{"command": ["x"]}', "run holds no result"),
-        ("scenario.toml", "a = [", "run holds a file that cannot be read: "),
-        ("trajectory.csv", None, "run holds a simulate that is not finished"),
-        ("trajectory.csv", "", "run holds a file that cannot be read: "),
-        ("trajectory.csv", "t,x1\n0.0,1.0\n0.1", "run holds a file that cannot be read: "),
-        ("trajectory.csv", "t,x1\n0.0,1.0\n0.1,1.0e-", "run holds a file that cannot be read: "),
+        ("scenario.toml", None, "the scenario file run/scenario.toml does not exist"),
+        ("scenario.toml", "a = [", "the scenario file run/scenario.toml is no valid TOML: "),
+        ("scenario.toml", "", "run/scenario.toml is damaged or of another version: 'controller' is missing; "),
+        ("trajectory.csv", None, "run/trajectory.csv does not exist: "),
+        ("trajectory.csv", "", "run/trajectory.csv is damaged or of another version: it has no rows; "),
+        ("trajectory.csv", "a,b\n0,1\n", "run/trajectory.csv is damaged or of another version: 't' is missing; "),
+        ("trajectory.csv", "t,x1\n0.0,1.0\n0.1", "run/trajectory.csv is damaged or of another version: line 3 must "),
+        ("trajectory.csv", "t,x1\n0.0,1.0\n0.1,1.0e-", "run/trajectory.csv is damaged or of another version: "),
     ):
         if content is None:
             (simulated / name).unlink()

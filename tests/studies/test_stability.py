@@ -51,6 +51,8 @@ def test_margins_command_writes_table_figures_and_page(command, tmp_path, plant)
     assert "all inputs" in made
     for text in (out, made):  # CHAIN has dispersions, and required margins are judged with them
         assert "by the worst of 256 dispersed loops" in text
+    (folder / "margins.csv").unlink()
+    assert "margins.csv does not exist: " in refused(command, tmp_path, "report", folder)
 
 
 def of_axes(rows, found, names, seen):

@@ -5,6 +5,7 @@ nothing from elsewhere; every text is escaped.
 """
 
 import base64
+import contextlib
 import csv
 import hashlib
 import json
@@ -27,7 +28,15 @@ from tuning.output.report import Block, Chart, Code, Picture, Section, Table
 from tuning.studies import front
 
 HERE = Path(__file__).parent
-INPUT_FILES = ("versions.json", store.SUMMARY, "scenario.toml", "trajectory.csv", "history.csv", "map.csv")  # to read
+# the table of a finished result, by command
+TABLES = {
+    "simulate": "trajectory.csv",
+    "tune": "history.csv",
+    "map": "map.csv",
+    "margins": "margins.csv",
+    "compare": "compare.csv",
+}
+INPUT_FILES = ("versions.json", store.SUMMARY, "scenario.toml", *TABLES.values())  # to read
 PNG_HEADER = b"\x89PNG\r\n\x1a\n"  # first bytes of a PNG file
 # caption of the scenario in a page, by command: whose gains it has
 SCENARIO_NOTES = {
@@ -75,8 +84,9 @@ class Result:
 
     folder: Path
     versions: dict[str, Any]
+    source: Path  # the file with the summary
     summary: dict[str, Any]
-    scenario: dict[str, Any]  # tables of scenario.toml; empty without a scenario
+    scenario: dict[str, Any]  # tables of scenario.toml; empty for `ptsmc reproduce`
 
     @property
     def plant(self) -> str:
@@ -85,34 +95,52 @@ class Result:
 
 
 def read(folder: Path) -> Result:
-    """Read a result folder. Raises RefusedError if it holds no finished result."""
+    """Read a result folder. Raises RefusedError or ScenarioError if it holds no finished result."""
     if not folder.is_dir():
         raise RefusedError(f"{folder} is no folder; allowed is a folder that a ptsmc command wrote")
     for name in INPUT_FILES:
         if _is_outside(folder, folder / name):
             raise RefusedError(f"{folder / name} is a link out of the folder; allowed is a file in it")
     versions = store.read_versions(folder)
-    command = versions.get("command")
-    if str(command) not in reports.REPORTS:
+    command = str(versions.get("command"))
+    if command not in reports.REPORTS:
         raise RefusedError(f"{folder} holds no result; allowed is a folder that a ptsmc command wrote")
+    source = folder / ("map.csv" if command == "map" else store.SUMMARY)
+    for path in (source, folder / TABLES.get(command, source.name)):
+        if not path.exists():
+            remedy = "to its end" if path.name == store.SUMMARY else "with --force"
+            raise RefusedError(
+                f"{path} does not exist: the results of `ptsmc {command}` are incomplete; run the same command {remedy}"
+            )
+    with _name_in_errors(source):
+        is_map = command == "map"
+        summary = {"rows": _read_rows(source)} if is_map else msgspec.json.decode(source.read_bytes(), type=dict)
+    scenario = {} if command == "reproduce" else parsing.read_toml(folder / "scenario.toml")
+    return Result(folder, versions, source, summary, scenario)
+
+
+@contextlib.contextmanager
+def _name_in_errors(path: Path) -> Iterator[None]:
+    """Raise RefusedError with the name of a file instead of the errors that its content causes."""
     try:
-        if command == "map":
-            summary = {"rows": _read_rows(folder / "map.csv")}
-        else:
-            summary = json.loads((folder / store.SUMMARY).read_text(encoding="utf-8"))
-        path = folder / "scenario.toml"
-        scenario = parsing.read_toml(path) if path.exists() else {}
-    except FileNotFoundError:
-        raise _unfinished_error(folder, versions) from None
-    except (csv.Error, ValueError, RecursionError) as error:
-        raise RefusedError(f"{folder} holds a file that cannot be read: {error}") from None
-    return Result(folder, versions, summary, scenario)
+        yield
+    except RefusedError:
+        raise
+    except (csv.Error, AttributeError, LookupError, TypeError, ValueError, RecursionError) as error:
+        problem = f"{error} is missing" if isinstance(error, KeyError) else error
+        raise RefusedError(f"{path} is damaged or of another version: {problem}; make it again") from None
 
 
 def _read_rows(path: Path) -> list[list[str]]:
     """Return all rows of a CSV file; the first one has the names of the columns."""
     with path.open(newline="", encoding="utf-8") as file:
-        return list(csv.reader(file))
+        rows = list(csv.reader(file))
+    if len(rows) < 2:
+        raise ValueError("it has no rows")
+    for number, row in enumerate(rows, 1):
+        if len(row) != len(rows[0]):
+            raise ValueError(f"line {number} must have {len(rows[0])} cells, one for each column name")
+    return rows
 
 
 def _is_outside(folder: Path, path: Path) -> bool:
@@ -121,16 +149,12 @@ def _is_outside(folder: Path, path: Path) -> bool:
     return not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
 
 
-def _unfinished_error(folder: Path, versions: dict[str, Any]) -> RefusedError:
-    unfinished = f"{folder} holds a {versions['command']} that is not finished"
-    return RefusedError(f"{unfinished}; run the same command to its end")
-
-
 def build(folder: Path) -> str:
     """Return the page of a result folder.
 
     Raises:
-        RefusedError: the folder holds no finished result, or files that cannot be read.
+        RefusedError: the folder holds no finished result, or a damaged file.
+        ScenarioError: its scenario.toml cannot be read.
         UsageError: plotly or jinja2 is not installed.
     """
     result = read(folder)
@@ -139,16 +163,9 @@ def build(folder: Path) -> str:
         from plotly.offline import get_plotlyjs
     except ImportError as error:
         raise UsageError(f"the page needs {error.name}: pip install 'ptsmc-jax[report]'") from None
-    try:
+    with _name_in_errors(result.source):
         report = reports.build(result.versions["command"], result.summary, result.plant)
-        charts = _charts(result)
-    except FileNotFoundError:
-        raise _unfinished_error(folder, result.versions) from None
-    except (msgspec.ValidationError, KeyError, AttributeError, TypeError) as error:
-        version = result.versions.get("ptsmc-jax")
-        raise RefusedError(f"{folder} holds a summary of another version ({version}): {error}; make it again") from None
-    except (csv.Error, IndexError, ValueError) as error:  # for example, a CSV file is truncated
-        raise RefusedError(f"{folder} holds a file that cannot be read: {error}") from None
+    charts = _charts(result)
     sections = [
         *(replace(section, blocks=[*charts.pop(section.title, []), *section.blocks]) for section in report.sections),
         *(Section(title, blocks) for title, blocks in charts.items()),
@@ -180,8 +197,9 @@ def _history_charts(result: Result) -> list[Block]:
     head, *rows = _read_rows(result.folder / "trajectory.csv")
     values = np.array([[float(cell or "nan") for cell in row] for row in rows])
     columns = dict(zip(head, values.T, strict=True))
-    law = result.scenario["controller"]
-    marks = {"t_f": law["t_f"]}
+    with _name_in_errors(result.folder / "scenario.toml"):
+        law = result.scenario["controller"]
+        marks = {"t_f": law["t_f"]}
     if law.get("delta", 0.0) >= 0.05 * columns["t"][-1]:  # otherwise the labels of t_f - delta and t_f overlap
         marks["t_f - delta"] = law["t_f"] - law["delta"]
     spacecraft = result.plant == "spacecraft"
@@ -213,16 +231,18 @@ def _front_chart(result: Result) -> Chart:
 def _charts(result: Result) -> dict[str, list[Block]]:
     """Return the charts and the table that only the page shows, by the titles of their sections."""
     command = result.versions["command"]
-    if command == "simulate":
-        return {"History": _history_charts(result)}
-    if command == "tune":
-        return {"Search": [_search_chart(result)]}
-    if command == "montecarlo":
-        return {"Gains": [campaign_report.gain_table(result.scenario, result.plant)]}
-    if command == "compare":
-        return compare_report.charts(summaries.read(summaries.Compare, result.summary).laws)
-    if command == "pareto" and result.summary["against"] == "torque":
-        return {front.KINDS["torque"].title: [_front_chart(result)]}
+    files = {"simulate": TABLES["simulate"], "tune": TABLES["tune"], "montecarlo": "scenario.toml"}
+    with _name_in_errors(result.folder / files.get(command, store.SUMMARY)):
+        if command == "simulate":
+            return {"History": _history_charts(result)}
+        if command == "tune":
+            return {"Search": [_search_chart(result)]}
+        if command == "montecarlo":
+            return {"Gains": [campaign_report.gain_table(result.scenario, result.plant)]}
+        if command == "compare":
+            return compare_report.charts(summaries.read(summaries.Compare, result.summary).laws)
+        if command == "pareto" and result.summary["against"] == "torque":
+            return {front.KINDS["torque"].title: [_front_chart(result)]}
     return {}
 
 
