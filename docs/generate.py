@@ -46,7 +46,20 @@ bound](theory/lower_bound.md).
 | it never settles | `settling_time` is null, and a limit on `settling_time` is violated |
 | it diverged or met the singularity of the law | it has a status, a reason and a time, and violates every requirement |
 | another metric is infinite or has no value | it counts as diverged at t_end |
-| it is `not_converged`: at t_f it is far from the reference | its metrics count |"""
+| it is `not_converged`: at t_f it is far from the reference | its metrics count |
+
+`verdicts` in `summary.json` has an entry for each requirement:
+
+| key | unit | meaning |
+| --- | --- | --- |
+| `limit` | the metric's | largest allowed value; smallest allowed value if `at_least` is true |
+| `worst` | the metric's | largest value of all trials; smallest value if `at_least` is true |
+| `margin` | - | `worst` / `limit`, or 2 - `worst` / `limit` if `at_least` is true; never negative |
+| `met` | - | whether the requirement is met |
+
+The requirement is met if `margin` is at most 1: 0.2 is 20 % of the limit, and 1.1 is 10 % beyond it. With a quantile,
+`margin` uses the value at the quantile instead of `worst`. For a fraction of the time, `margin` is the fraction beyond
+the limit, divided by the allowed fraction. It is null if a failed trial counts, or if the trials are too few."""
 ERRORS = """\
 With `controller.error = "additive"` the attitude error vector is eps_1 = q_1 - q_1f, as in the paper. With
 `"multiplicative"`, and for the comparison laws, it is the vector part of q_f* q. The units x1, x2 and u are those of
