@@ -128,6 +128,7 @@ def test_campaign_runs_the_exported_controller_and_copies_it(command, tmp_path):
         (SHORT, ("--trials", "101"), 'Invalid value "101" for --trials. Must be <= 100.'),
         (SHORT, ("--seed", "-1"), 'Invalid value "-1" for --seed. Must be >= 0.'),
         (SHORT, ("--fmu", "--fmi", "4"), 'Invalid value "4" for --fmi. Choose from: 2, 3.'),
+        (SHORT, ("--name", ""), '--name is "", but must have a letter from A to Z or a digit'),
         (SHORT, ("--fmi", "2"), "--fmi is 2, but must be absent without --fmu or --fmu-plant"),
         (SHORT, ("--no-binary",), "--no-binary is given, but must be absent without --fmu or --fmu-plant"),
     ],

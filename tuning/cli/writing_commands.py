@@ -1,6 +1,7 @@
 """Commands that write files without a study: a page of results, a scenario, C code; and convert attitudes."""
 
 import json
+import re
 import shlex
 from importlib.resources import files
 from pathlib import Path
@@ -150,6 +151,8 @@ def export(
     if not (fmu or fmu_plant) and (fmi is not None or no_binary):
         option = "--no-binary is given" if fmi is None else f"--fmi is {fmi}"
         raise UsageError(f"{option}, but must be absent without --fmu or --fmu-plant")
+    if name is not None and not re.search("[A-Za-z0-9]", name):
+        raise UsageError(f'--name is "{name}", but must have a letter from A to Z or a digit')
     loaded, folder = prepare(scenario, "export", out, trust=trust, force=force)
     from ptsmc_jax.campaigns import store
     from ptsmc_jax.onboard import folder as controllers
