@@ -110,7 +110,7 @@ def design(
         _to_frame(expected),
         number_std(best_information),
         number_std(information(plain_momentum)[0]),
-        estimation.describe_undetermined(problem, best_information, by_z),
+        estimation.describe_undetermined(problem, best_information - np.diag(search.prior_weight), by_z),
     )
 
 

@@ -80,6 +80,17 @@ def test_a_design_has_a_profile_within_the_limits(command, logged):
     assert command("report", "plan")[0] == 0
 
 
+def test_a_design_names_parameters_that_are_known_better_than_the_manoeuvre_can_determine_them(command, logged):
+    """The prior counts as knowledge before the manoeuvre. An earlier version counted it as information of the data."""
+    known = SCENARIO.replace('prior = "none"', 'prior = "dispersion"')
+    known += '[dispersion]\nactuator_scale = { kind = "relative_normal", std = 1e-6 }\n'
+    (logged / "known.toml").write_text(known)
+    status, _, err = command("identify", "known.toml", "--design", "--duration", 6, "--rate", 0.5, "--out", "plan")
+    assert (status, err) == (0, "")
+    (sentence,) = json.loads((logged / "plan" / "summary.json").read_text())["undetermined"]
+    assert "actuator_scale" in sentence
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
