@@ -29,9 +29,7 @@ CODE_KEYS = ("system", "truth", "code")  # keys that name code, in any table
 DATA_FILE_KEY = "reference.file"  # key that names a data file
 CONTROLLER_OPTION = "--controller"  # option that names the exported C code, unlike the key `controller.code`
 REDECLARABLE_FIELD = "delta"  # field of the base class that a custom law may declare again, as a gain
-Code = Annotated[
-    Any, Meta(description=systems.NAME_FORMS), Meaning('the class, "FILE.py:NAME" or "package.module:NAME"')
-]
+Code = Annotated[Any, Meta(description=systems.NAME_FORMS), Meaning("the class")]
 
 
 class Custom:

@@ -16,6 +16,7 @@ import pytest
 
 from ptsmc_jax.scenario import from_tables, keys, layouts, parsing
 from ptsmc_jax.scenario.attitude_keys import ATTITUDE_KEYS
+from ptsmc_jax.scenario.sensor_tables import SENSORS
 from ptsmc_jax.simulation import catalogues
 from tests.helpers import ROOT, refused
 from tests.scenario.every_key import ATTITUDE, COMMANDS, blocks, complete, key_of, kinds, values
@@ -82,12 +83,18 @@ def test_every_key_of_the_plant_is_written_with_its_meaning(plant):
     found = blocks(text)
     names = list(layouts.TABLES[plant])
     names.insert(names.index("tune"), "requirements")
+    tables = dict(layouts.TABLES[plant])
+    if plant == "spacecraft":
+        names.insert(names.index("sensors") + 1, "[sensors]")
+        tables["[sensors]"] = SENSORS
     assert list(found) == names
-    for name, table in layouts.TABLES[plant].items():
+    for name, table in tables.items():
         said = kinds(found[name])
         structs = list(table.values()) if isinstance(table, Mapping) else [table]
         assert len(said) == len(structs)
-        explained = set() if name == "initial" else ATTITUDE  # attitude keys are explained in [initial] only
+        explained = (
+            set() if name in ("initial", "[sensors]") else ATTITUDE
+        )  # attitude keys are explained in [initial] only
         for lines, struct in zip(said, structs, strict=True):
             wanted = {key.name: key.meaning for key in keys.list_keys(struct) if key.name not in explained}
             assert {key_of(line) for line in lines} - {"kind", *explained} == set(wanted), (name, struct)
@@ -95,6 +102,37 @@ def test_every_key_of_the_plant_is_written_with_its_meaning(plant):
     assert ("[unit of d" in text) == (layouts.SCENARIOS[plant].unit_of_d == keys.UNIT_OF_D)
     for metric in catalogues.CATALOGUES[plant]:  # the key of the metric itself requires a fraction of time
         assert bool(re.search(rf"\b{metric}\b", text)) == (not metric.startswith(catalogues.WITHIN)), metric
+
+
+SENSOR_TEXT = """
+[loop]
+mode = "sampled"
+[[sensors]]
+kind = "gyro"
+rate_noise_density = "0.02 deg/sqrt(h)"
+[[sensors]]
+kind = "star_tracker"
+noise_across = "8 arcsec"
+[[sensors]]
+kind = "star_tracker"
+rotvec_deg = [90.0, 0.0, 0.0]
+noise_across = 4e-5
+"""
+
+
+def test_new_like_a_list_of_sensors_writes_the_same_sensors():
+    """An earlier version ended in a traceback."""
+    given = from_tables(tomllib.loads(SENSOR_TEXT))
+    text = new.scenario_text(None, tomllib.loads(SENSOR_TEXT))
+    assert parsing.dump(from_tables(tomllib.loads(text))) == parsing.dump(given)
+    assert [table["kind"] for table in tomllib.loads(text)["sensors"]] == ["gyro", "star_tracker", "star_tracker"]
+
+
+def test_commented_sensors_are_valid_together():
+    groups = kinds(blocks(new.scenario_text(None, {}))["[sensors]"])
+    for excluded in ({"rotvec_deg", "rate_noise"}, {"boresight", "rate_noise_density"}):
+        sensors = [{key: v for key, v in values(lines).items() if key not in excluded} for lines in groups]
+        from_tables({"loop": {"mode": "sampled"}, "sensors": sensors})
 
 
 @pytest.mark.parametrize("plant", ["spacecraft", "chain"])

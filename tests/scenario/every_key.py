@@ -8,7 +8,7 @@ from tests.onboard.flights import PROFILE
 from tuning.cli import new
 
 KEY = re.compile(r"^#?([a-z]\w*) = ")
-TABLE = re.compile(r"^#?\[(\w+)\]")
+TABLE = re.compile(r"^#?\[(\w+|\[\w+\])\]")
 ATTITUDE = {*ATTITUDE_KEYS, "sequence"}
 COMMANDS = {"torque", "wheel_torque", "wheel_speed"}
 
@@ -20,12 +20,12 @@ def key_of(line):
 
 
 def blocks(text):
-    """Return the lines with keys of each table, without the introduction of the file."""
+    """Return the lines with keys of each table, without the introduction of the file. [[sensors]] is "[sensors]"."""
     found, name = {}, None
     for line in text.splitlines():
         if match := TABLE.match(line):
             name = match[1]
-            found[name] = []
+            found.setdefault(name, [])
         elif name and key_of(line):
             found[name].append(line)
     return found
@@ -71,6 +71,8 @@ def complete(plant):
     drawn = base | ({"flexible": {}, "wheels": {}, "filter": {}} if plant == "spacecraft" else {})  # for dispersions
     every = []
     for name, lines in found.items():
+        if name == "[sensors]":
+            continue
         groups = kinds(lines)
         if name == "dispersion":
             groups = [[line] for line in lines]

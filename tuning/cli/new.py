@@ -12,6 +12,7 @@ from ptsmc_jax.scenario.attitude_keys import Attitude
 from ptsmc_jax.scenario.custom import Custom
 from ptsmc_jax.scenario.law_tables import LawTable
 from ptsmc_jax.scenario.schema import PartTable
+from ptsmc_jax.scenario.sensor_tables import SENSORS
 from ptsmc_jax.scenario.tables import Scenario, Tune
 from ptsmc_jax.scenario.values import Table
 from ptsmc_jax.simulation import catalogues
@@ -35,6 +36,15 @@ EXAMPLES: dict[str, Any] = {
     "orbit.earth_angle": 0.0,
     "disturbance.orbit_rate": 1.1e-3,
     "sensors.code": "my_parts.py:MySensors",
+    "sensors.boresight": [0.0, 0.0, 1.0],
+    "sensors.rotvec_deg": [0.0, 90.0, 0.0],
+    "sensors.period": 0.5,
+    "sensors.noise_across": 4e-5,
+    "sensors.noise_about": 2e-4,
+    "sensors.direction": [1.0, 0.0, 0.0],
+    "sensors.noise": 1e-3,
+    "sensors.rate_noise": 1e-6,
+    "sensors.rate_noise_density": 2e-7,
     "dispersion.code": "my_parts.py:MyDraw",
     "plant.truth": "my_plant.py:true_plant",
     "spacecraft.true_inertia": [10.5, 12.6, 14.7],
@@ -84,6 +94,10 @@ EXAMPLES: dict[str, Any] = {
     "identify.torque_walk": 1e-6,
 }
 REQUIREMENTS = {"window_error": {"limit": 1e-4, "quantile": 0.9973, "confidence": 0.9}, "peak_torque": 0.5}
+SENSOR_LIST = (
+    "Any number of sensors, a table each: at least one gyro, and attitude sensors that determine the attitude "
+    "together. They replace the noise of [hardware] and [filter], the short form for one star tracker and one gyro."
+)
 INTRODUCTION = """\
 A scenario for ptsmc. Every key is optional: an absent key has the value shown here. Tables that are off, like
 #[hardware], stay off. To use a line such as #delay = 1, remove its # and the # of its table. Units are in brackets.
@@ -108,10 +122,14 @@ class _ScenarioFile:
             if name == "tune":
                 yield from ("", *self.requirement_lines())
             yield from ("", *self.table_lines(name, table))
+            if name == "sensors" and self.plant == "spacecraft":
+                yield from ("", *self.sensor_list_lines())
 
     def table_lines(self, name: str, table: type[Table] | layouts.Kinds) -> Iterator[str]:
         """Return the lines of a table, followed by the keys of its other kinds as comments."""
         stated, values = self.stated_tables.get(name), self.values.get(name, {})
+        if isinstance(stated, list):  # see `sensor_list_lines`
+            stated, values = None, {}
         kinds = table if isinstance(table, Mapping) else {}
         kind = self.plant if name == "plant" else values.get("kind", next(iter(kinds), None))
         struct = table if isinstance(table, type) else kinds[kind]
@@ -119,16 +137,27 @@ class _ScenarioFile:
             yield from _comment_lines(keys.description(struct))
         yield f"{'#' if stated is None else ''}[{name}]"
         yield from self.kind_lines(name, kind, struct, stated, values)
-        declared = struct.__struct_fields__
-        if issubclass(struct, Custom):
-            for key in (key for key in stated or () if key not in ("kind", *declared)):
-                yield from _key_lines(False, key, values[key], "custom")
+        yield from self.custom_lines(struct, stated, values)
         if issubclass(struct, Attitude) and name != "initial":
             yield from _comment_lines("its attitude by one of the keys of [initial]")
         for other, alternative in kinds.items():
             if other != kind:
                 yield ""
                 yield from self.kind_lines(name, other, alternative, None, {})
+
+    def sensor_list_lines(self) -> Iterator[str]:
+        """Return the lines of the sensors of the scenario, then of the other kinds of sensors as comments."""
+        yield from _comment_lines(SENSOR_LIST)
+        stated = self.stated_tables.get("sensors")
+        sensors = list(zip(stated, self.values["sensors"], strict=True)) if isinstance(stated, list) else []
+        for keys_given, values in sensors:
+            yield from ("", "[[sensors]]")
+            kind = values["kind"]
+            yield from self.kind_lines("sensors", kind, SENSORS[kind], keys_given, values)
+            yield from self.custom_lines(SENSORS[kind], keys_given, values)
+        for kind in (kind for kind in SENSORS if kind not in {values["kind"] for _, values in sensors}):
+            yield from ("", "#[[sensors]]")
+            yield from self.kind_lines("sensors", kind, SENSORS[kind], None, {})
 
     def kind_lines(
         self, name: str, kind: str | None, struct: type[Table], stated: dict[str, Any] | None, values: dict[str, Any]
@@ -146,7 +175,7 @@ class _ScenarioFile:
             yield from _key_lines(stated is None, "kind", kind, keys.description(struct))
         values = {**self.default_values(name, struct), **values}
         # the attitude keys are explained at [initial] only; other tables show those that the scenario has
-        explained_before = Attitude.__struct_fields__ if name != "initial" else ()
+        explained_before = Attitude.__struct_fields__ if name not in ("initial", "sensors") else ()
         for key in keys.list_keys(struct, self.resolved.unit_of_d):
             is_off = stated is None or key.name not in stated
             kinds = layouts.DISPERSIONS[key.name] if name == "dispersion" else layouts.KINDS.get(f"{name}.{key.name}")
@@ -155,6 +184,15 @@ class _ScenarioFile:
             elif not (is_off and key.name in explained_before):
                 value = values[key.name] if key.name in values else self.example_value(name, kind, key)
                 yield from _key_lines(is_off, key.name, value, _describe_key(key))
+
+    def custom_lines(
+        self, struct: type[Table], stated: Mapping[str, Any] | None, values: Mapping[str, Any]
+    ) -> Iterator[str]:
+        """Return the lines of the fields of a custom class."""
+        if issubclass(struct, Custom):
+            for key in stated or ():
+                if key not in ("kind", *struct.__struct_fields__):
+                    yield from _key_lines(False, key, values[key], "custom")
 
     def inline_lines(self, name: str, key: keys.Key, chosen: Mapping[str, Any], kinds: layouts.Kinds) -> Iterator[str]:
         """Return a line for each kind of an inline table; all but the kind in the scenario are comments.
@@ -207,6 +245,8 @@ class _ScenarioFile:
         value = EXAMPLES[f"{table}.{key.name}"]
         if key.allowed.endswith("for each state"):
             return [value] * len(self.resolved.plant.x0)
+        if key.allowed.endswith("for each component of a reading"):
+            return [value] * 3
         if key.allowed.endswith("for each axis, wheel or input"):
             return [value] * self.resolved.inputs
         return [value] * (4 if kind == "pyramid" else 3) if key.allowed.endswith("for each wheel") else value
