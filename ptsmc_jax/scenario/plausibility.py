@@ -113,14 +113,12 @@ def _noisy_estimate(scenario: Scenario, disturbance_bound: float) -> Iterator[st
     """Warn about an observer whose estimate has more noise than the disturbance has amplitude."""
     noise = estimate_noise(scenario)
     if noise > disturbance_bound > 0.0:
-        gain = scenario.observer.gain
-        rounded = [float(f"{one:.4g}") for one in gain]
-        shown = errors.brief(rounded if len(set(gain)) > 1 else rounded[0])
+        shown = errors.brief([float(f"{one:.4g}") for one in scenario.observer.gain])
         unit = " N m" if scenario.motion == "spacecraft" else ""
         yield (
             f"observer.gain is {shown}: the noise of its estimate, "
             f"{noise:.2g}{unit} (1 sigma), is larger than the disturbance, at most {disturbance_bound:.3g}{unit}; "
-            "try a smaller gain"
+            'try a smaller gain, or observer.kind = "none"'
         )
 
 

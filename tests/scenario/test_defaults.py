@@ -250,7 +250,7 @@ QUIET = {"kind": "constant", "amplitude": [1e-6] * 3}
         ),
         (
             {**NOISY, "disturbance": QUIET, "observer": {"gain": [0.07] * 3}},
-            ["observer.gain is 0.07", "larger than the disturbance", "at most 1e-06"],
+            ["observer.gain is [0.07, 0.07, 0.07]", "larger than the disturbance", "at most 1e-06"],
         ),
         ({**NOISY, "disturbance": QUIET, "observer": {"gain": [1e-4] * 3}}, []),
         ({**NOISY, "disturbance": {"kind": "none"}}, []),
