@@ -57,6 +57,9 @@ def resolve(scenario: Scenario) -> Scenario:
         ScenarioError: the inertia, which determines defaults, is not that of a body, or devices contradict each other.
     """
     scenario.check_body()
+    if scenario.loop.mode is None:
+        loop = msgspec.structs.replace(scenario.loop, mode=scenario.default_mode())
+        scenario = msgspec.structs.replace(scenario, loop=loop)
     ratios, law = mission.scales(scenario), scenario.controller
     tables = {
         name: mission.fill_scaled_defaults(getattr(scenario, name), ratios)

@@ -33,13 +33,12 @@ class Loop(Table, frozen=True):
     """Type of the control loop, and the times of a run."""
 
     mode: Annotated[
-        Literal["continuous", "sampled"],
+        Literal["continuous", "sampled"] | None,
         Meaning(
-            "continuous: the law is evaluated inside the "
-            "integrator. sampled: it is computed once a control "
-            "period and held"
+            "continuous: the law is evaluated inside the integrator. sampled: it is computed once a control period "
+            "and held; default: sampled with [hardware], [sensors], [wheels] or [filter], otherwise continuous"
         ),
-    ] = "continuous"
+    ] = None
     period: Annotated[
         ResolvedPositive,
         Meaning(
@@ -252,6 +251,11 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
             law: kind of the law.
         """
         return {}
+
+    def default_mode(self) -> Literal["continuous", "sampled"]:
+        """Return "sampled" if there are devices, which need the sampled loop, and "continuous" otherwise."""
+        devices = (getattr(self, name, None) for name in ("hardware", "sensors", "wheels", "filter"))
+        return "continuous" if all(one is None for one in devices) else "sampled"
 
     @property
     def sampled(self) -> bool:

@@ -222,6 +222,24 @@ def test_defaults_change_with_replaced_values_and_stated_values_do_not():
     assert scenario.from_tables(parsing.stated_tables(slow)) == slow
 
 
+SENSORS = [{"kind": "gyro", "rate_noise": 1e-6}, {"kind": "star_tracker", "noise_across": 4e-5}]
+
+
+@pytest.mark.parametrize(
+    ("tables", "mode"),
+    [
+        ({}, "continuous"),
+        ({"loop": {"period": 0.1}}, "continuous"),
+        ({"hardware": {"torque_limit": 1.0}}, "sampled"),
+        ({"wheels": {"torque_limit": 0.2}}, "sampled"),
+        ({"sensors": SENSORS}, "sampled"),
+        ({"plant": {"kind": "chain"}, "hardware": {"delay": 1}}, "sampled"),
+    ],
+)
+def test_the_loop_is_sampled_by_default_if_there_are_devices(tables, mode):
+    assert scenario.from_tables(tables).loop.mode == mode
+
+
 def test_setting_gains_in_a_scenario_changes_no_other_value():
     walk = {"kind": "random_walk", "density": [1e-5] * 3}
     said = scenario.from_tables({"loop": SAMPLED, "tune": {}, "disturbance": walk})

@@ -466,7 +466,11 @@ def test_replace_adds_a_table():
             "initial has the attitude keys quat_xyzw and mrp",
             ONE_KEY,
         ),
-        ({"hardware__rate_noise": 1e-6}, "hardware.rate_noise needs the sampled loop", 'loop.mode is "continuous"'),
+        (
+            {"hardware__rate_noise": 1e-6, "loop__mode": "continuous"},
+            "hardware.rate_noise needs the sampled loop",
+            'loop.mode is "continuous"',
+        ),
         ({"controller": 5, "controller__eta": 3.0}, "controller is 5", "a table"),
         ({"controller": 5, "controller__eta": None}, "controller is 5", "a table"),
     ],
