@@ -99,6 +99,14 @@ class Verdict:
         least = must_keep(self.trials, self.quantile, self.confidence)
         return least is not None and self.trials - self.failures >= least
 
+    @property
+    def word(self) -> str:
+        """The verdict as text: "met", "NOT met", or "NOT shown" if there are too few trials to verify the quantile."""
+        if self.met:
+            return "met"
+        too_few = must_keep(self.trials, self.quantile, self.confidence) is None
+        return "NOT shown" if too_few and self.interpretation != "temporal" else "NOT met"
+
     @classmethod
     def read(cls, entry: Mapping[str, Any]) -> "Verdict":
         """Return the verdict of an entry in `summary.json`. A null there is a number that is not finite."""
@@ -119,14 +127,13 @@ class Verdict:
         limit = quantity(self.limit, self.unit, 6)
         population = INTERPRETATIONS[self.interpretation]
         requirement = f"{self.metric} at most {limit} in {100 * self.quantile:g} % of {population}"
-        met = "met" if self.met else "NOT met"
         if self.interpretation == "temporal":
             beyond = "" if self.met or self.trials == 1 else f", {self.failures} of {self.trials} runs have less"
-            return f"{requirement}: the least of a run is {percent(fraction)} %: {met}{beyond}"
+            return f"{requirement}: the least of a run is {percent(fraction)} %: {self.word}{beyond}"
         result = f"{percent(fraction)} %"
         if self.confidence is not None and self.shown is not None:
             result += f", at least {percent(self.shown)} % at {100 * self.confidence:g} % confidence"
-        return f"{requirement}: {result}: {met}"
+        return f"{requirement}: {result}: {self.word}"
 
     def _describe_trials(self) -> str:
         failures, trials, worst = self.failures, self.trials, self.worst
@@ -146,14 +153,13 @@ class Verdict:
             result = (f"worst {loop_count}" if trials > 1 else "") + number
         least = must_keep(trials, self.quantile, self.confidence)
         if least is None and self.quantile is not None and self.confidence is not None:
-            fewest = fewest_trials(self.quantile, self.confidence)
-            return f"{requirement}: {result}: NOT shown, which takes at least {fewest} trials"
-        if self.met:
-            return f"{requirement}: {result}: met" + (f", beyond it {failures} of {trials} {noun}" if failures else "")
-        allowed = f", at most {trials - least} allowed" if least is not None and trials > least else ""
-        return f"{requirement}: {result}: NOT met" + (
-            f" in {failures} of {trials} {noun}{allowed}" if trials > 1 else ""
-        )
+            reason = f", which takes at least {fewest_trials(self.quantile, self.confidence)} trials"
+        elif self.met:
+            reason = f", beyond it {failures} of {trials} {noun}" if failures else ""
+        else:
+            allowed = f", at most {trials - least} allowed" if least is not None and trials > least else ""
+            reason = f" in {failures} of {trials} {noun}{allowed}" if trials > 1 else ""
+        return f"{requirement}: {result}: {self.word}{reason}"
 
 
 def quantity(value: float, unit: str, digits: int) -> str:

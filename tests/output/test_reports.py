@@ -322,6 +322,18 @@ def compared() -> Table:
     return compare_report.answer_table(compare_report.QUESTIONS[0], laws)
 
 
+def compliance() -> Table:
+    """Return the compliance table of too few runs without a failure, and of enough runs with a failure."""
+    asked = Requirement("ape_x", 1e-4, quantile=0.99, confidence=0.9)
+    seen = [asked.verdict(np.full(trials, peak), np.ones(trials, bool)) for trials, peak in ((9, 5e-5), (999, 2e-4))]
+    few_in_time = Requirement("ape_y", 1e-4, quantile=0.99, confidence=0.9, interpretation="mixed")
+    verdicts = [*seen, few_in_time.verdict(np.zeros(9), np.ones(9, bool), np.ones(9))]
+    (section,) = campaign_report.pointing_sections(examples.campaign(verdicts=[one.in_summary() for one in verdicts]))
+    (table,) = section.blocks
+    assert isinstance(table, Table)
+    return table
+
+
 def budget(simulated: int, ok: int, not_converged: int = 0) -> str:
     """Return the reason of an absent angle of a budget; runs that do not converge by t_f have angles."""
     told = {"after": 0.0, "boresight": [1.0, 0.0, 0.0], "probability": 0.9973, "confidence": 0.95, "window": 1.0,
@@ -392,6 +404,7 @@ OTHERS: dict[str, Callable[[], Any]] = {
     "best pair of a map": lambda: pairs(4),
     "one pair of a map": lambda: pairs(1),
     "comparison of two laws": compared,  # 1.5e+03 times the lower bound are 1500
+    "compliance of too few runs": compliance,
     # 1109 runs are needed for 95 % confidence, and all must reach their end
     "pointing budget without an angle": lambda: [
         budget(2000, 2000), budget(1108, 1098), budget(1109, 1099), budget(1109, 1049, 50),

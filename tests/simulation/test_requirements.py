@@ -136,6 +136,7 @@ def test_a_campaign_of_one_trial_demonstrates_no_fraction():
     told = Requirement("peak_torque", LIMIT, None, 0.99, 0.9).verdict(np.array([0.4]), np.array([True]))
     assert not told.met
     assert str(told).endswith("0.4: NOT shown, which takes at least 230 trials")
+    assert told.word == "NOT shown"
 
 
 @pytest.mark.parametrize("trials", [2, 3, 10])
@@ -196,7 +197,7 @@ def test_mixed_requires_a_fraction_of_the_time_of_all_runs():
     never = of_time("mixed", np.ones(852), confidence=0.9)
     assert never.met  # as many runs without a violation as for an ensemble
     assert never.shown == pytest.approx(0.1 ** (1 / 852))
-    assert not of_time("mixed", np.ones(851), confidence=0.9).met
+    assert of_time("mixed", np.ones(851), confidence=0.9).word == "NOT shown"
     # half of the runs exceed the limit for 1/200 of the time, which would violate an ensemble requirement
     kept = np.where(np.arange(RUNS) % 2, 1.0, 0.995)
     told = of_time("mixed", kept)
@@ -207,7 +208,7 @@ def test_mixed_requires_a_fraction_of_the_time_of_all_runs():
     assert sure.shown is not None
     assert 0.9973 < sure.shown < 0.9975
     assert sure.met
-    assert not of_time("mixed", many, confidence=0.999).met
+    assert of_time("mixed", many, confidence=0.999).word == "NOT met"
     # only runs are independent: with n runs, a fraction 1 - 0.1^(1/n), about 2.3/n, may fail without being observed
     fewer = of_time("mixed", kept, confidence=0.9)
     assert fewer.shown == pytest.approx(0.9975 - 2.3 / RUNS, abs=1e-4)

@@ -213,7 +213,7 @@ def _compliance_row(verdict: Entry) -> tuple[str, ...]:
         str(verdict.trials),
         str(verdict.failures),
         _runs_needed(verdict),
-        "met" if verdict.met else "NOT met",
+        verdict.word,
     )
 
 

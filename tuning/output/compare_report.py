@@ -207,7 +207,7 @@ def answer_table(question: Question, laws: dict[str, Law]) -> Table:
             cells.insert(1, "-" if bounds is None else f"{format_ratio(bounds[0])} to {format_ratio(bounds[1])}")
         if question.judged:
             violations = {
-                verdict.metric: f"{verdict.failures} of {verdict.trials}" + ("" if verdict.met else ": NOT met")
+                verdict.metric: f"{verdict.failures} of {verdict.trials}" + ("" if verdict.met else f": {verdict.word}")
                 for verdict in law.verdicts
             }
             cells += [*(violations.get(metric, "-") for metric in required), "yes" if law.met else "no"]

@@ -42,6 +42,11 @@ class Entry(msgspec.Struct, frozen=True):
     fraction_bound: Number = None
     fewest_trials: int | None = None
 
+    @property
+    def word(self) -> str:
+        """The verdict as one of the texts of `Verdict.word`."""
+        return Verdict.read(msgspec.structs.asdict(self)).word
+
     def __str__(self) -> str:
         """Return the verdict in one line."""
         return str(Verdict.read(msgspec.structs.asdict(self)))
