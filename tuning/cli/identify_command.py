@@ -28,7 +28,8 @@ def identify(
 
     With --design it proposes the manoeuvre to record instead.
 
-    Exit status: 0 the model explains the logs and every parameter is determined, 1 not, 2 configuration error.
+    Exit status: 0 the model explains the logs, and logs and prior knowledge together determine every parameter; 1 not;
+    2 configuration error.
 
     Args:
         validate: Log that is predicted only, to check the model; several times.
