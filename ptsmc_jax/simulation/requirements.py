@@ -149,8 +149,7 @@ class Verdict:
             result = "no value" if trials == 1 else "no worst value"
         else:
             loop_count = f"of {trials} dispersed loops " if noun == "loops" else ""
-            number = quantity(worst, self.unit, 4) if self.unit in ("rad", "rad/s") else f"{worst:.4g}"
-            result = (f"worst {loop_count}" if trials > 1 else "") + number
+            result = (f"worst {loop_count}" if trials > 1 else "") + quantity(worst, self.unit, 4)
         least = must_keep(trials, self.quantile, self.confidence)
         if least is None and self.quantile is not None and self.confidence is not None:
             reason = f", which takes at least {fewest_trials(self.quantile, self.confidence)} trials"
@@ -178,7 +177,7 @@ class Requirement:
 
     >>> limit = Requirement("peak_torque", 0.5, quantile=0.75)
     >>> print(limit.verdict(np.array([0.3, 0.4, 0.45, 0.7]), np.array([True, True, True, True])))
-    peak_torque at most 0.5 N m in 75 % of trials: worst 0.7: met, beyond it 1 of 4 trials
+    peak_torque at most 0.5 N m in 75 % of trials: worst 0.7 N m: met, beyond it 1 of 4 trials
     """
 
     metric: str

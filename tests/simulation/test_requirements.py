@@ -26,8 +26,8 @@ def test_a_verdict_over_many_loops_says_that_they_are_dispersed():
     """The verdict of a single loop prints the value alone."""
     required = Requirement("gain_margin", 6.0, "dB", at_least=True)
     many, one = (required.verdict(np.asarray(v), np.ones(np.shape(v), bool)) for v in ([7.0, 6.2, 9.0], 6.2))
-    assert str(many) == "gain_margin at least 6 dB: worst of 3 dispersed loops 6.2: met"
-    assert str(one) == "gain_margin at least 6 dB: 6.2: met"
+    assert str(many) == "gain_margin at least 6 dB: worst of 3 dispersed loops 6.2 dB: met"
+    assert str(one) == "gain_margin at least 6 dB: 6.2 dB: met"
 
 
 @settings(max_examples=100, deadline=None, derandomize=True, database=None)
@@ -55,10 +55,10 @@ def test_a_verdict_carries_the_unit_of_its_metric(metric):
 
 
 def test_a_verdict_prints_one_sentence():
-    assert str(verdict([0.1, 0.25])) == "peak_torque at most 0.5 N m: worst 0.25: met"
+    assert str(verdict([0.1, 0.25])) == "peak_torque at most 0.5 N m: worst 0.25 N m: met"
     said = str(verdict([0.1, 0.75, 0.9]))
-    assert said == "peak_torque at most 0.5 N m: worst 0.9: NOT met in 2 of 3 trials"
-    assert str(verdict([0.75])) == "peak_torque at most 0.5 N m: 0.75: NOT met"
+    assert said == "peak_torque at most 0.5 N m: worst 0.9 N m: NOT met in 2 of 3 trials"
+    assert str(verdict([0.75])) == "peak_torque at most 0.5 N m: 0.75 N m: NOT met"
     assert str(verdict([0.1], [False])) == "peak_torque at most 0.5 N m: no value: NOT met"
     lost = str(verdict([0.1, 0.2], [False, True]))
     assert lost == "peak_torque at most 0.5 N m: no worst value: NOT met in 1 of 2 trials"
@@ -129,13 +129,13 @@ def test_failed_trials_count_as_violations():
 def test_a_single_run_is_judged_by_the_limit_alone():
     told = Requirement("peak_torque", LIMIT, None, 0.99, 0.9).verdict(np.asarray(0.4), np.asarray(True))
     assert told.met
-    assert str(told) == "peak_torque at most 0.5 N m: 0.4: met"
+    assert str(told) == "peak_torque at most 0.5 N m: 0.4 N m: met"
 
 
 def test_a_campaign_of_one_trial_demonstrates_no_fraction():
     told = Requirement("peak_torque", LIMIT, None, 0.99, 0.9).verdict(np.array([0.4]), np.array([True]))
     assert not told.met
-    assert str(told).endswith("0.4: NOT shown, which takes at least 230 trials")
+    assert str(told).endswith("0.4 N m: NOT shown, which takes at least 230 trials")
     assert told.word == "NOT shown"
 
 
@@ -155,13 +155,13 @@ def test_a_fraction_is_printed_in_words():
     share = Requirement("peak_torque", LIMIT, None, 0.99, 0.9)
     said = "peak_torque at most 0.5 N m in 99 % of trials with 90 % confidence: worst"
     ok = np.ones(1000, bool)
-    assert str(share.verdict(values, ok)) == f"{said} 0.4: met"
+    assert str(share.verdict(values, ok)) == f"{said} 0.4 N m: met"
     values[:3] = 0.6
-    assert str(share.verdict(values, ok)) == f"{said} 0.6: met, beyond it 3 of 1000 trials"
+    assert str(share.verdict(values, ok)) == f"{said} 0.6 N m: met, beyond it 3 of 1000 trials"
     values[:9] = 0.6
-    assert str(share.verdict(values, ok)) == f"{said} 0.6: NOT met in 9 of 1000 trials, at most 5 allowed"
+    assert str(share.verdict(values, ok)) == f"{said} 0.6 N m: NOT met in 9 of 1000 trials, at most 5 allowed"
     few = str(share.verdict(values[:50], ok[:50]))
-    assert few == f"{said} 0.6: NOT shown, which takes at least 230 trials"
+    assert few == f"{said} 0.6 N m: NOT shown, which takes at least 230 trials"
 
 
 RUNS = 1000

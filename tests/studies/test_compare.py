@@ -359,7 +359,7 @@ def test_required_margins_appear_in_table_csv_file_and_report(eight, tmp_path):
         assert table.head == ("", "gain [dB]", "delay [s]")
         assert table.rows == [("published gains", "5.04", "unlimited"), ("prescribed time", "-", "0.2")]
         lines = lines_of(said)
-        assert "  gain_margin at least 6 dB: worst of 2 dispersed loops 5.04: NOT met in 1 of 2 loops" in lines
+        assert "  gain_margin at least 6 dB: worst of 2 dispersed loops 5.04 dB: NOT met in 1 of 2 loops" in lines
         assert "  gain_margin at least 6 dB: no worst value: NOT met in 1 of 2 loops" in lines
         assert not [line for line in lines if "delay_margin" in line]
     assert "no law meets every requirement" in page.build(tmp_path / "out")
