@@ -41,6 +41,10 @@ Metrics are in `summary.json`, in the rows of a campaign and in `[requirements]`
 mean, largest value and quantiles. For `window_error` it lists the RMS and `lower_bound`, the [lower
 bound](theory/lower_bound.md).
 
+The terminal and the figures show angles in arcsec or degrees. They show `terminal_error`, `window_error` and
+`hold_error` of a spacecraft as the angle 2 asin |v| of the norm |v|. The files have each metric in the unit of the
+tables below.
+
 | run | in the summary |
 | --- | --- |
 | it never settles | `settling_time` is null, and a limit on `settling_time` is violated |

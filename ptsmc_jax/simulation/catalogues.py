@@ -4,8 +4,10 @@ The functions that compute them are in `metrics` and `pointing`.
 """
 
 import math
-from typing import NamedTuple
+from collections.abc import Iterable
+from typing import Any, NamedTuple
 
+from ptsmc_jax.formulas import pointing_angle
 from ptsmc_jax.simulation import pointing
 from ptsmc_jax.simulation.metrics import METRICS
 from ptsmc_jax.simulation.pointing import AXES as AXES
@@ -33,6 +35,8 @@ CATALOGUE = {
 POINTING = tuple(pointing.METRICS)
 # metrics of other plants, whose x_1 is the error, in the units of their states and inputs
 STATE_CATALOGUE = {name: Entry(*metric.of_states) for name, metric in METRICS.items() if metric.of_states is not None}
+# norms |v| of attitude errors [-], and the metrics with the same errors as angles
+ANGLE_METRICS = {"terminal_error": "terminal_angle", "window_error": "window_angle", "hold_error": "hold_angle"}
 MAY_BE_ZERO = ("saturated",)  # metrics that a requirement may limit to zero
 LARGER_IS_BETTER = tuple(f"{WITHIN}{name}" for name in TIME_FRACTION_METRICS)  # all other metrics are better if smaller
 # units that a limit may be stated in, by the unit of its metric or key: name -> value in that unit
@@ -78,6 +82,24 @@ NO_SIGN = "the discontinuous sign has no derivative: margins are those of the lo
 def units(kind: str) -> dict[str, str]:
     """Return the unit of each metric, and of `initial_angle`, for this kind of plant."""
     return {name: entry.unit for name, entry in CATALOGUES[kind].items()} | {"initial_angle": ANGLE_UNITS[kind]}
+
+
+def as_angle(metric: str, unit: str, value: Any) -> tuple[str, Any]:
+    """Return the unit and the value of a metric. A norm |v| of an attitude error becomes the angle 2 asin |v| [rad].
+
+    Texts and figures show these angles. Files have the metrics themselves.
+    """
+    return ("rad", pointing_angle(value)) if metric in ANGLE_METRICS and unit == "-" else (unit, value)
+
+
+def without_norms(metrics: Iterable[str]) -> list[str]:
+    """Return the different metrics, without those whose angle is also among them.
+
+    >>> without_norms(["window_error", "peak_torque", "window_angle"]), without_norms(["window_error"])
+    (['peak_torque', 'window_angle'], ['window_error'])
+    """
+    names = list(dict.fromkeys(metrics))
+    return [name for name in names if ANGLE_METRICS.get(name) not in names]
 
 
 def percent(fraction: float) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ptsmc_jax.formulas import angle_unit
-from ptsmc_jax.simulation.catalogues import CATALOGUE, MARGINS, WITHIN, percent
+from ptsmc_jax.simulation.catalogues import CATALOGUE, MARGINS, WITHIN, as_angle, percent
 
 
 def must_keep(trials: int, quantile: float | None, confidence: float | None) -> int | None:
@@ -124,7 +124,7 @@ class Verdict:
 
     def _describe_time(self, fraction: float) -> str:
         assert self.quantile is not None
-        limit = quantity(self.limit, self.unit, 6)
+        limit = quantity(self.limit, self.unit, 6, self.metric)
         population = INTERPRETATIONS[self.interpretation]
         requirement = f"{self.metric} at most {limit} in {100 * self.quantile:g} % of {population}"
         if self.interpretation == "temporal":
@@ -138,7 +138,7 @@ class Verdict:
     def _describe_trials(self) -> str:
         failures, trials, worst = self.failures, self.trials, self.worst
         noun = "loops" if self.metric in MARGINS else "trials"  # margins may be computed for more loops than trials
-        limit = quantity(self.limit, self.unit, 6)
+        limit = quantity(self.limit, self.unit, 6, self.metric)
         requirement = f"{self.metric} at {'least' if self.at_least else 'most'} {limit}"
         if self.quantile is not None:
             requirement += f" in {100 * self.quantile:g} % of trials"
@@ -149,7 +149,7 @@ class Verdict:
             result = "no value" if trials == 1 else "no worst value"
         else:
             loop_count = f"of {trials} dispersed loops " if noun == "loops" else ""
-            result = (f"worst {loop_count}" if trials > 1 else "") + quantity(worst, self.unit, 4)
+            result = (f"worst {loop_count}" if trials > 1 else "") + quantity(worst, self.unit, 4, self.metric)
         least = must_keep(trials, self.quantile, self.confidence)
         if least is None and self.quantile is not None and self.confidence is not None:
             reason = f", which takes at least {fewest_trials(self.quantile, self.confidence)} trials"
@@ -161,8 +161,16 @@ class Verdict:
         return f"{requirement}: {result}: {self.word}{reason}"
 
 
-def quantity(value: float, unit: str, digits: int) -> str:
-    """Return a number with its unit: angles in arcsec, from one degree on in degrees, and rates also in degrees."""
+def quantity(value: float, unit: str, digits: int, metric: str = "") -> str:
+    """Return a number with its unit: angles in arcsec, from one degree on in degrees, and rates also in degrees.
+
+    Args:
+        value: the number, in its unit.
+        unit: the unit.
+        digits: number of significant digits.
+        metric: name of the metric. The norm of an attitude error is returned as an angle, see `as_angle`.
+    """
+    unit, value = as_angle(metric, unit, value)
     if unit == "rad/s":
         return f"{value:.{digits}g} {unit} ({math.degrees(value):.4g} deg/s)"
     if unit == "rad":

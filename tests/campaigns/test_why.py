@@ -49,12 +49,11 @@ def test_inputs_of_the_worst_trial_have_percentile_median_and_sensitivity(monkey
                        "rank_correlation": pytest.approx(1.0, rel=1e-12),
                        "first_order": pytest.approx(1.0, abs=0.05), "trials": 401}  # fmt: skip
     assert told[1]["percentile"] == 100.0 * np.mean(rate <= rate[400])
-    (said,) = campaign_report.explanation_lines(told, "spacecraft")
-    assert (
-        said == "peak_torque 4 N m in trial 400: initial_angle 2 rad at 100.0 % (median 1)"
-    )  # the rate has no effect on the torque
+    (said,) = campaign_report.explanation_lines(told, Rows().units)
+    # the rate has no effect on the torque
+    assert said == "peak_torque 4 N m in trial 400: initial_angle 114.6 deg at 100.0 % (median 57.3 deg)"
     table = table.with_columns(peak_torque=np.random.default_rng(5).permutation(401) / 50.0)
-    (said,) = campaign_report.explanation_lines(why(Rows(), ["peak_torque"], 1), "spacecraft")
+    (said,) = campaign_report.explanation_lines(why(Rows(), ["peak_torque"], 1), Rows().units)
     assert said.endswith("no sampled input explains it; sensor noise remains")
     # the number of a failed wheel is a category without an order; here wheel 2 causes the largest torques
     wheel = np.arange(401) % 4 + 1.0
@@ -65,7 +64,7 @@ def test_inputs_of_the_worst_trial_have_percentile_median_and_sensitivity(monkey
     assert one["rank_correlation"] is None
     assert one["first_order"] > 0.5
     assert "wheel_failure_wheel 2 as in 24.9 % of the trials" in "".join(
-        campaign_report.explanation_lines(told, "spacecraft")
+        campaign_report.explanation_lines(told, Rows().units)
     )
     drivers = {"peak_torque": statistics.drivers({"wheel_failure_wheel": wheel, "initial_w1": rate},
                                                  table["peak_torque"].to_numpy(), categories=CATEGORIES)}  # fmt: skip
@@ -76,7 +75,7 @@ def test_inputs_of_the_worst_trial_have_percentile_median_and_sensitivity(monkey
     told = why(Rows(), ["peak_torque"], 1)
     # unusual inputs of a failed trial
     assert "wheel_failure_wheel 1 as in 25.2 % of the trials" in "".join(
-        campaign_report.explanation_lines(told, "spacecraft")
+        campaign_report.explanation_lines(told, Rows().units)
     )
     # metrics of a failed run are those until its failure; sensitivities must not use them
     cut = np.where(np.arange(401) % 3 == 0, 1e3 * (1.0 - rate), table["peak_torque"].to_numpy())

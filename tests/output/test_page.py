@@ -61,8 +61,10 @@ def test_a_run_becomes_a_page(command, simulated):
     assert after["report.html"].decode() == page.build(simulated)
     assert store.MADE_OF_RESULTS["report.html"] in after["report.html"][:1024]
     summary = json.loads((simulated / "summary.json").read_text())
-    for name in ("window_error", "peak_torque", "hold_error"):
-        assert f"{summary[name]:.5g}" in read.text
+    angle = np.degrees(summary["window_angle"])
+    assert f"window_angle {3600.0 * angle if angle < 1.0 else angle:.5g}" in read.text
+    assert f"{summary['window_error']:.5g}" not in read.text  # the same error as a number without a unit
+    assert f"peak_torque {summary['peak_torque']:.5g} N m" in read.text
     assert summary["settling_time"] is None
     assert "settling_time never s" in read.text
     assert "ptsmc simulate s.toml --trial 3 --seed 5" in read.text

@@ -15,6 +15,7 @@ import pytest
 
 from ptsmc_jax.campaigns.store import to_json_value
 from ptsmc_jax.numerics import statistics
+from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.catalogues import MARGINS
 from ptsmc_jax.simulation.requirements import Requirement
 from tests.output import examples
@@ -375,11 +376,20 @@ def approach(judged: bool) -> Report:
     return margins_report.build(summaries.read(summaries.Margins, summary))
 
 
+def worst_trials(by: str, **columns: list[Any]) -> Table:
+    """Return the table of two trials; an error of 1e-5 is an angle of 4.13 arcsec."""
+    known = {"trial": [7, 3], "status": ["diverged", "ok"], "window_error": [None, 1e-5], "window_angle": [None, 2e-5],
+             "peak_torque": [0.2, 0.1], "initial_angle": [0.5, 1e-3], "initial_w2": [2e-3, 1e-3],
+             **columns}  # fmt: skip
+    units = {**catalogues.units("spacecraft"), "initial_w2": "rad/s"}
+    return campaign_report.worst_trial_table(pl.DataFrame(known), by, units)
+
+
 def why(*rows: dict[str, Any], **changes: Any) -> Iterable[str]:
     """Return the reasons of a trial. Each row is an input, in which a category has a fraction of equal trials."""
     alike = {"metric": "effort", "trial": 3, "value": None, "drawn": 2.0, "unit": "", "fraction": None, "median": 1.0,
              "percentile": None, "rank_correlation": None, "first_order": None, **changes}  # fmt: skip
-    return campaign_report.explanation_lines([{**alike, **row} for row in rows], "spacecraft")
+    return campaign_report.explanation_lines([{**alike, **row} for row in rows], catalogues.units("spacecraft"))
 
 
 OTHERS: dict[str, Callable[[], Any]] = {
@@ -401,6 +411,10 @@ OTHERS: dict[str, Callable[[], Any]] = {
     "how to replay a trial": lambda: campaign_report.replay_hint(
         pl.DataFrame({"trial": [7], "window_error": [0.1]}), Path("my out"), is_custom=True
     ),
+    "worst trials by the error": lambda: worst_trials("window_error"),
+    "worst trials by the angle": lambda: worst_trials("window_angle"),
+    "worst trials by an input": lambda: worst_trials("initial_w2"),
+    "worst trials by a custom metric": lambda: worst_trials("mine", mine=[2.0, 1.0], settling_time=[None, 3]),
     "best pair of a map": lambda: pairs(4),
     "one pair of a map": lambda: pairs(1),
     "comparison of two laws": compared,  # 1.5e+03 times the lower bound are 1500
@@ -422,7 +436,8 @@ OTHERS: dict[str, Callable[[], Any]] = {
     ),
     # by the distance from the 50 % percentile: 49, 37.5, 20, 5 and 2; categories by half the fraction of other trials
     "the four most unusual inputs of a failed trial": lambda: why(
-        *({"input": f"initial_{name}", "percentile": at} for name, at in (("angle", 70.0), ("w1", 52.0), ("w2", 1.0))),
+        {"input": "initial_angle", "unit": "rad", "percentile": 70.0},
+        *({"input": f"initial_{name}", "unit": "rad/s", "percentile": at} for name, at in (("w1", 52.0), ("w2", 1.0))),
         *({"input": name, "fraction": at} for name, at in (("wheel_failure_wheel", 0.25), ("custom_1", 0.9))),
     ),
 }  # fmt: skip

@@ -68,6 +68,10 @@ def test_a_verdict_prints_one_sentence():
 def test_verdicts_print_angles_in_arcsec_and_rates_in_degrees_too():
     turned = Requirement("hold_angle", np.deg2rad(0.1)).verdict(np.deg2rad([0.05, 0.02]), np.array([True, True]))
     assert str(turned) == "hold_angle at most 360 arcsec: worst 180 arcsec: met"
+    error = Requirement("window_error", 1e-5).verdict(np.asarray(5e-6), np.array(True))  # the sine of half the angle
+    assert str(error) == "window_error at most 4.1253 arcsec: 2.063 arcsec: met"
+    of_state = Requirement("window_error", 1e-5, "x1").verdict(np.asarray(5e-6), np.array(True))
+    assert str(of_state) == "window_error at most 1e-05 x1: 5e-06 x1: met"
     turning = Requirement("peak_rate", np.deg2rad(2.0)).verdict(np.deg2rad(3.0), np.array(True))
     assert str(turning) == "peak_rate at most 0.0349066 rad/s (2 deg/s): 0.05236 rad/s (3 deg/s): NOT met"
 

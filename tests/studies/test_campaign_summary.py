@@ -1,5 +1,6 @@
 """Requirements on fractions of time, lower bound and margins in the summary and the figures of a campaign."""
 
+import inspect
 import json
 from types import SimpleNamespace
 from typing import Any
@@ -8,8 +9,10 @@ import numpy as np
 import polars as pl
 import pytest
 
+from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import margin_verdicts, runs
 from ptsmc_jax.figures.campaign_plots import AT_TIMES, BEYOND
+from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.requirements import Requirement
 from tuning.studies import campaign_figures, campaign_summary, campaign_theory
 
@@ -102,3 +105,25 @@ def test_bound_and_margins_use_the_first_trials_and_are_computed_once(tmp_path, 
     campaign_theory.write_missing(folder)
     assert len(asked) == 2
     assert campaign_theory.read(folder)["lower_bound"] == 1e-6
+
+
+@pytest.mark.parametrize(("required", "shown"), [
+    ("window_angle", ["window_angle [arcsec]", "peak_torque [N m]"]),
+    ("effort", ["effort [N m s]", "window_error [arcsec]", "peak_torque [N m]"]),
+])  # fmt: skip
+def test_the_figure_of_distributions_shows_an_error_once_and_as_an_angle(monkeypatch, required, shown):
+    error = np.linspace(1e-6, 1e-5, 20)
+    frame = pl.DataFrame({
+        "trial": np.arange(20), "status": ["ok"] * 20, "initial_angle": error, "window_error": error,
+        "window_angle": 2.0 * np.arcsin(error), "peak_torque": error, "effort": error,
+    })  # fmt: skip
+    monkeypatch.setattr(campaign_figures.rows, "read", lambda parts, names: frame.select(names))
+    folder: Any = SimpleNamespace(
+        scenario=scenario.from_tables({"requirements": {required: 5e-5}}), units=catalogues.units("spacecraft"),
+        intact_parts=list, trials=20, can_simulate=False,
+    )  # fmt: skip
+    figures = inspect.unwrap(campaign_figures.build)(folder, {"verdicts": [], "drivers": {}})
+    panels = figures["distributions"].axes
+    assert [axes.get_xlabel() for axes in panels] == shown
+    points = np.asarray(panels[shown.index(next(name for name in shown if "arcsec" in name))].lines[0].get_xdata())
+    np.testing.assert_allclose(points[[0, -1]], 2.0 * np.degrees([1e-6, 1e-5]) * 3600.0, rtol=1e-6)

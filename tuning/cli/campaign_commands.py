@@ -264,10 +264,9 @@ def worst(
         inputs = campaign_summary.explain_worst_trials(campaign, list(dict.fromkeys((by, *required))), n)
         store.write_csv(folder / "why.csv", list(inputs[0]) if inputs else [], [list(row.values()) for row in inputs])
     if not quiet:
-        plant = campaign.scenario.plant.kind
-        terminal.print_table(campaign_report.worst_trial_table(frame, by, plant))
+        terminal.print_table(campaign_report.worst_trial_table(frame, by, campaign.units))
         terminal.print_lines(campaign_report.replay_hint(frame, folder, is_custom=bool(campaign.custom_code)))
-        terminal.print_lines(*campaign_report.explanation_lines(inputs, plant))
+        terminal.print_lines(*campaign_report.explanation_lines(inputs, campaign.units))
     return 0
 
 

@@ -2,7 +2,7 @@
 
 import itertools
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +12,6 @@ from ptsmc_jax.simulation.catalogues import AXES, INDICES, percent
 from ptsmc_jax.simulation.requirements import fewest_trials
 from tuning.output import report
 from tuning.output.formats import (
-    add_unit,
     format_angle,
     format_count,
     format_named_error,
@@ -106,13 +105,14 @@ def quantile_tables(summary: Campaign) -> list[Table]:
     failed = sum(count for status, count in summary.counts.items() if status not in ("ok", "not_converged"))
     for worst, (head, note) in QUANTILE_TABLES.items():
         rows = []
-        for name, quantiles in summary.quantiles.items():
+        for name in catalogues.without_norms(summary.quantiles):
+            quantiles = summary.quantiles[name]
             tail = quantiles.high if worst == "max" else quantiles.low
             if _is_pointing_index(name) or tail is None:
                 continue
             has_missing_values = quantiles.without_value > failed  # for example of runs that end but never settle
             values = quantiles.median["value"], tail["value"], tail["low"], tail["high"], getattr(quantiles, worst)
-            unit, shown = in_readable_unit(units.get(name, ""), *values)
+            unit, shown = in_readable_unit(name, units.get(name, ""), *values)
             median, bound, low, high, extreme = (format_number(value, ".3g") for value in shown)
             rows.append((name, median, bound, f"{low}..{high}", "none" if has_missing_values else extreme, unit))
         if rows:
@@ -126,7 +126,7 @@ def driver_lines(summary: Campaign) -> Iterator[str]:
     An input is named if it explains a significant fraction of at least `statistics.MIN_EXPLAINED` of the variance.
     """
     unexplained = list[str]()
-    for metric in dict.fromkeys(("window_error", *(one.metric for one in summary.verdicts))):
+    for metric in catalogues.without_norms(("window_error", *(one.metric for one in summary.verdicts))):
         sensitivities = summary.drivers.get(metric, {})
         explained = {
             name: statistics.explained_variance(driver, summary.driver_trials[metric])
@@ -249,15 +249,18 @@ def gain_table(scenario: dict[str, Any], plant: str) -> Table:
     return Table(("key", "value", "unit"), rows)
 
 
-def worst_trial_table(frame: "pl.DataFrame", by: str, plant: str) -> Table:
-    """Return the table of the worst trials by a metric, the worst first; plant: kind of the plant."""
+def worst_trial_table(frame: "pl.DataFrame", by: str, units: Mapping[str, str]) -> Table:
+    """Return the table of the worst trials by a metric, the worst first; units: unit of each column."""
     columns = ("trial", "status", by, "window_error", "peak_torque", "settling_time", "initial_angle")
-    names = [name for name in dict.fromkeys(columns) if name in frame.columns]
-    rows = [
-        tuple("-" if v is None else f"{v:.5g}" if isinstance(v, float) else str(v) for v in row)
-        for row in frame.select(names).iter_rows()
-    ]
-    return Table(tuple(add_unit(name, plant) for name in names), rows)
+    head, cells = [], []
+    for name in catalogues.without_norms(name for name in columns if name in frame.columns):
+        unit, values = units.get(name, ""), frame[name].to_list()
+        if frame[name].dtype.is_float():
+            unit, numbers = in_readable_unit(name, unit, *values)
+            values = [format_number(number, ".5g") for number in numbers]
+        head.append(f"{name} [{unit}]" if unit.strip("-") else name)
+        cells.append(["-" if value is None else str(value) for value in values])
+    return Table(tuple(head), list(zip(*cells, strict=True)))
 
 
 def replay_hint(frame: "pl.DataFrame", folder: Path, *, is_custom: bool) -> str:
@@ -266,14 +269,14 @@ def replay_hint(frame: "pl.DataFrame", folder: Path, *, is_custom: bool) -> str:
     return f"all columns are in {folder / 'worst.csv'}; replay one trial with {call}"
 
 
-def explanation_lines(inputs: list[dict[str, Any]], plant: str) -> Iterator[str]:
+def explanation_lines(inputs: list[dict[str, Any]], units: Mapping[str, str]) -> Iterator[str]:
     """Return the inputs that explain a metric in each of the worst trials, as percentiles of all trials.
 
     If the trial failed, or too few trials show an influence, the inputs farthest from their medians are named.
 
     Args:
         inputs: rows of `campaign_summary.explain_worst_trials`.
-        plant: kind of the plant.
+        units: unit of each metric.
     """
     for (metric, trial), group in itertools.groupby(inputs, lambda row: (row["metric"], row["trial"])):
         rows = list(group)
@@ -285,30 +288,27 @@ def explanation_lines(inputs: list[dict[str, Any]], plant: str) -> Iterator[str]
             rows = [row for fraction, row in explained if fraction >= statistics.MIN_EXPLAINED]
         else:
             rows.sort(key=_distance_from_median, reverse=True)
-        texts = [
-            f"{row['input']} {_format_with_unit(row['drawn'], row['unit'])} {_describe_percentile(row)}"
-            for row in rows[:4]
-        ]
-        unit = catalogues.units(plant).get(metric, "")  # a custom metric has no unit
-        reached = f"no {metric}" if value is None else f"{metric} {_format_with_unit(value, unit)}"
+        texts = [_describe_input(row) for row in rows[:4]]
+        reached = f"no {metric}"
+        if value is not None:
+            unit, (number,) = in_readable_unit(metric, units.get(metric, ""), value)  # a custom metric has no unit
+            reached = f"{metric} {number:.4g} {unit}".rstrip(" -")
         nothing_found = "no sampled input explains it; sensor noise remains"
         yield f"{reached} in trial {trial}: {', '.join(texts) or nothing_found}"
 
 
-def _describe_percentile(row: dict[str, Any]) -> str:
-    """Return the percentile of an input among all trials."""
+def _describe_input(row: dict[str, Any]) -> str:
+    """Return the value of an input in a trial, and its percentile among all trials."""
+    unit, (drawn, median) = in_readable_unit(row["input"], row["unit"], row["drawn"], row["median"])
+    text = f"{row['input']} {drawn:.4g} {unit}".rstrip(" -")
     if row["fraction"] is not None:
-        return f"as in {percent(row['fraction'])} % of the trials"
-    return f"at {row['percentile']:.1f} % (median {row['median']:.3g})"
+        return f"{text} as in {percent(row['fraction'])} % of the trials"
+    return f"{text} at {row['percentile']:.1f} % (median {f'{median:.3g} {unit}'.rstrip(' -')})"
 
 
 def _distance_from_median(row: dict[str, Any]) -> float:
     """Return the distance of an input from the median in per cent, or how few trials have the same value."""
     return 50.0 * (1.0 - row["fraction"]) if row["fraction"] is not None else abs(row["percentile"] - 50.0)
-
-
-def _format_with_unit(value: float, unit: str) -> str:
-    return f"{value:.4g} {unit}".rstrip(" -")
 
 
 def replay_lines(difference: float | None, history_difference: float, tolerance: float) -> Iterator[str]:

@@ -49,19 +49,32 @@ def format_angle(value: float | None) -> str:
     return f"{arcsec:.0f} arcsec" if abs(arcsec) >= 999.5 else f"{arcsec:.3g} arcsec"
 
 
-def in_readable_unit(unit: str, *values: float | None) -> tuple[str, list[float | None]]:
-    """Return values of a metric in a readable unit: angles [rad] in arcsec or, from one degree on, in degrees.
+def in_readable_unit(name: str, unit: str, *values: float | None) -> tuple[str, list[float]]:
+    """Return values in a readable unit: angles in arcsec or, if one is at least one degree, in degrees.
 
-    >>> in_readable_unit("rad", 1e-3, None)[0], in_readable_unit("rad", 0.1)[0], in_readable_unit("N m", 0.1)
-    ('arcsec', 'deg', ('N m', [0.1]))
+    Args:
+        name: name of the metric or the input. The norm of an attitude error becomes an angle, see `as_angle`.
+        unit: unit of the values.
+        values: the values, None or NaN if there is none.
+
+    Returns:
+        The readable unit, and the values, NaN for None.
+
+    >>> in_readable_unit("hold_angle", "rad", 1e-3, None)[0], in_readable_unit("hold_angle", "rad", 1e-3, 0.1)[0]
+    ('arcsec', 'deg')
+    >>> in_readable_unit("window_error", "-", 1e-6)[0], in_readable_unit("window_error", "x1", 1e-6)
+    ('arcsec', ('x1', [1e-06]))
     """
-    if unit != "rad":
-        return unit, [*values]
-    from ptsmc_jax.formulas import angle_unit  # here, so that `ptsmc --help` does not import NumPy
+    import numpy as np  # here, so that `ptsmc --help` does not import NumPy and JAX
 
-    sizes = [abs(value) for value in values if value is not None and math.isfinite(value)]
-    unit, factor = angle_unit(max(sizes, default=0.0))
-    return unit, [None if value is None else factor * value for value in values]
+    from ptsmc_jax.formulas import angle_unit
+    from ptsmc_jax.simulation.catalogues import as_angle
+
+    unit, numbers = as_angle(name, unit, np.array(values, dtype=float))
+    if unit == "rad":
+        unit, factor = angle_unit(np.max(np.abs(numbers[np.isfinite(numbers)]), initial=0.0))
+        numbers = factor * numbers
+    return unit, numbers.tolist()
 
 
 def format_error(value: float | None, plant: str) -> str:
@@ -70,13 +83,7 @@ def format_error(value: float | None, plant: str) -> str:
     >>> format_error(1e-6, "spacecraft"), format_error(1e-6, "chain"), format_error(float("nan"), "chain")
     ('0.413 arcsec', '1e-06 x1', '-')
     """
-    if value is None or math.isnan(value):
-        return "-"
-    if plant != "spacecraft":
-        return format_metric(value, "window_error", plant)
-    from ptsmc_jax.formulas import pointing_angle  # here, so that `ptsmc --help` does not import NumPy
-
-    return format_angle(float(pointing_angle(value)))
+    return "-" if value is None or math.isnan(value) else format_metric(value, "window_error", plant)
 
 
 def error_name(plant: str) -> str:
@@ -107,14 +114,14 @@ def format_objective(name: str, value: float, plant: str) -> str:
 def format_metric(value: float, metric: str, plant: str) -> str:
     """Return a metric of this kind of plant with its unit.
 
-    >>> format_metric(0.2813, "peak_torque", "spacecraft"), format_metric(3.1e-5, "window_error", "spacecraft")
-    ('0.281 N m', '3.1e-05')
+    >>> format_metric(0.2813, "peak_torque", "spacecraft"), format_metric(1e-5, "window_error", "spacecraft")
+    ('0.281 N m', '4.13 arcsec')
     >>> format_metric(1e-4, "ape_boresight", "spacecraft")
     '20.6 arcsec'
     """
-    from ptsmc_jax.simulation.catalogues import CATALOGUES  # imports JAX
+    from ptsmc_jax.simulation.catalogues import CATALOGUES, as_angle  # imports JAX
 
-    unit = CATALOGUES[plant][metric].unit
+    unit, value = as_angle(metric, CATALOGUES[plant][metric].unit, value)
     return format_angle(value) if unit == "rad" else f"{value:.3g} {unit}".rstrip(" -")
 
 

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from ptsmc_jax.campaigns import store
-from ptsmc_jax.simulation.catalogues import CATALOGUES
+from ptsmc_jax.simulation.catalogues import CATALOGUES, without_norms
 from tuning.output import campaign_report, compare_report, front_report, margins_report, report, summaries, tune_report
 from tuning.output.formats import (
     add_unit,
@@ -56,10 +56,10 @@ def run_report(summary: summaries.Run, plant: str) -> Report:
     if summary.controller_statuses:
         lines.append(f"samples of the controller: {list_counts(summary.controller_statuses)}")
     missing = "never" if summary.status in ("ok", "not_converged") else "-"
-    rows = []
+    rows, shown = [], without_norms(summary.metrics)
     for name, entry in CATALOGUES[plant].items():
-        if name in summary.metrics:
-            unit, (value,) = in_readable_unit(entry.unit, summary.metrics[name])
+        if name in shown:
+            unit, (value,) = in_readable_unit(name, entry.unit, summary.metrics[name])
             rows.append((name, format_number(value, ".5g", missing), unit, entry.meaning))
     metrics = Section("Metrics", [Table(("metric", "value", "unit", "meaning"), rows)])
     sections = [*report.requirement_sections(summary.verdicts), metrics]

@@ -189,8 +189,8 @@ def _conflict_lines(summary: Tune) -> Iterator[str]:
         elif verdict.at_least and needed <= 0.0:
             yield f"{metric} alone cannot give way far enough: the loop would be unstable"
         else:
-            limits = f"{quantity(needed, verdict.unit, 4)} instead of {quantity(verdict.limit, verdict.unit, 6)}"
-            yield f"if {metric} alone gives way, its limit must be {limits}"
+            new, old = quantity(needed, verdict.unit, 4, metric), quantity(verdict.limit, verdict.unit, 6, metric)
+            yield f"if {metric} alone gives way, its limit must be {new} instead of {old}"
     ratios = [ratio for metric in conflict if (ratio := worst[metric]) is not None]
     if len(conflict) > 1 and len(ratios) == len(conflict):
         yield f"if all of them give way together, each must by {100.0 * (max(ratios) - 1.0):.2g} % of its limit"
@@ -261,7 +261,9 @@ def _evolution_comparison(check: Row, record: Search) -> str:
 def _describe_violation(summary: Tune, metric: str, ratio: float | None) -> str:
     """Return the violation of a limit by the training trials, or the number of these that fail."""
     if ratio is not None and math.isfinite(ratio):
-        limit = next((f" of {quantity(v.limit, v.unit, 6)}" for v in summary.verdicts if v.metric == metric), "")
+        limit = next(
+            (f" of {quantity(v.limit, v.unit, 6, metric)}" for v in summary.verdicts if v.metric == metric), ""
+        )
         return f"{metric} reaches {_relative_to_limit(metric, ratio):.3g} times its limit{limit} on the training trials"
     failures = failed_counts(summary.training.counts)
     if not failures:

@@ -11,12 +11,10 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import campaign as running
 from ptsmc_jax.campaigns import rows
 from ptsmc_jax.figures import campaign_plots as plots
-from ptsmc_jax.formulas import pointing_angle
-from ptsmc_jax.simulation.catalogues import percent
+from ptsmc_jax.simulation.catalogues import as_angle, percent, without_norms
 from ptsmc_jax.simulation.requirements import INTERPRETATIONS, Requirement, Verdict
 from tuning.studies.campaign_folder import Folder
 
-ERRORS = ("terminal_error", "window_error", "hold_error")  # norms of error vectors
 FAN_TRIALS = 1000  # largest number of trials whose histories are plotted
 SCATTER_TRIALS = 5000  # largest number of trials in a scatter plot
 
@@ -26,17 +24,18 @@ def build(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
     parts = folder.intact_parts()
     required = scenario.requirements(folder.scenario)
     limits = {r.metric: r.limit for r in required}
-    names = list(dict.fromkeys((*limits, "window_error", "peak_torque")))
+    metrics = dict.fromkeys((*limits, "window_error", "peak_torque"))
+    names = without_norms(metrics)
     time_metrics = [r.timed for r in required if r.timed is not None]
-    frame = rows.read(parts, ["trial", "status", "initial_angle", *names, *time_metrics]).head(folder.trials)
+    frame = rows.read(parts, ["trial", "status", "initial_angle", *metrics, *time_metrics]).head(folder.trials)
     finished = running.has_finished(frame)
     time_fractions = {v["metric"]: _describe_time_fraction(Verdict.read(v)) for v in summary["verdicts"]}
-    units, spacecraft = folder.units, folder.scenario.plant.kind == "spacecraft"
+    units = folder.units
 
     def plotted_column(name: str, values: np.ndarray) -> plots.Column:
-        unit, limit = units.get(name, ""), limits.get(name)
-        if spacecraft and name in ERRORS:  # the norm of the error is plotted as an angle
-            unit, values, limit = "rad", pointing_angle(values), None if limit is None else float(pointing_angle(limit))
+        stated_unit, limit = units.get(name, ""), limits.get(name)
+        unit, values = as_angle(name, stated_unit, values)
+        limit = None if limit is None else float(as_angle(name, stated_unit, limit)[1])
         return plots.Column(unit, values, limit, time_fractions.get(name, "")).in_readable_unit()
 
     figures: dict[str, Figure] = {}
