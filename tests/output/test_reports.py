@@ -434,6 +434,11 @@ OTHERS: dict[str, Callable[[], Any]] = {
         {"input": "initial_w1", "unit": "rad/s", "percentile": 70.0},
         metric="settling_time", value=1.0, rank_correlation=0.15, first_order=0.06, trials=200,
     ),
+    "reasons of an error and of its angle": lambda: why(
+        {"metric": "window_error", "value": 1e-5, "input": "initial_w1"},
+        {"metric": "window_angle", "value": 2e-5, "input": "initial_w1"},
+        percentile=70.0,
+    ),
     # by the distance from the 50 % percentile: 49, 37.5, 20, 5 and 2; categories by half the fraction of other trials
     "the four most unusual inputs of a failed trial": lambda: why(
         {"input": "initial_angle", "unit": "rad", "percentile": 70.0},

@@ -272,13 +272,16 @@ def replay_hint(frame: "pl.DataFrame", folder: Path, *, is_custom: bool) -> str:
 def explanation_lines(inputs: list[dict[str, Any]], units: Mapping[str, str]) -> Iterator[str]:
     """Return the inputs that explain a metric in each of the worst trials, as percentiles of all trials.
 
-    If the trial failed, or too few trials show an influence, the inputs farthest from their medians are named.
+    If the trial failed, or too few trials show an influence, the inputs farthest from their medians are named. An error
+    and its angle have the same reasons, so only the reasons of the angle are returned.
 
     Args:
         inputs: rows of `campaign_summary.explain_worst_trials`.
         units: unit of each metric.
     """
-    for (metric, trial), group in itertools.groupby(inputs, lambda row: (row["metric"], row["trial"])):
+    metrics = catalogues.without_norms(row["metric"] for row in inputs)
+    shown = (row for row in inputs if row["metric"] in metrics)
+    for (metric, trial), group in itertools.groupby(shown, lambda row: (row["metric"], row["trial"])):
         rows = list(group)
         value = rows[0]["value"]
         measured = [row for row in rows if row["first_order"] is not None]
