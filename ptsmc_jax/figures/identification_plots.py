@@ -8,11 +8,12 @@ from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 from ptsmc_jax.figures import style
+from ptsmc_jax.formulas import ARCSEC
 from ptsmc_jax.identification import results
 from ptsmc_jax.identification.estimation import Fit, Identification
 
 POINTS = 4000  # largest number of points of a line
-UNITS = {"attitude": "rad", "rate": "rad/s"}  # units of innovations
+UNITS = {"attitude": ("arcsec", ARCSEC), "rate": ("rad/s", 1.0)}  # drawn units of innovations, and their factors
 
 
 def identification_figures(identification: Identification) -> dict[str, Figure]:
@@ -22,8 +23,9 @@ def identification_figures(identification: Identification) -> dict[str, Figure]:
         suffix = "" if k == 0 else f"_{k + 1}"
         names, t = results.component_names(fit), fit.log.t[1:]
         values, sigma = results.innovations(fit)
-        labels = [style.with_unit(name, UNITS.get(name.split("_")[0], "")) for name in names]
-        figures[f"innovations{suffix}"] = innovations(t, labels, values, sigma)
+        units, factors = zip(*(UNITS.get(name.split("_")[0], ("", 1.0)) for name in names), strict=True)
+        labels = [style.with_unit(name, unit) for name, unit in zip(names, units, strict=True)]
+        figures[f"innovations{suffix}"] = innovations(t, labels, values * factors, sigma * factors)
         counts = np.sum(np.isfinite(values), axis=0)
         figures[f"autocorrelation{suffix}"] = autocorrelation(names, fit.autocorrelation(), counts)
         figures[f"prediction{suffix}"] = signals(t, _predictions(fit, values))

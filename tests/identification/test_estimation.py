@@ -98,6 +98,18 @@ def test_a_notebook_shows_the_verdict_the_estimates_and_the_figures_of_each_log(
     assert list(found.plot("prediction_2")) == ["prediction_2"]
 
 
+def test_innovations_of_the_attitude_are_drawn_in_arcsec(identified):
+    found, _ = identified
+    panels = found.plot("innovations")["innovations"].axes
+    labels = [panel.get_ylabel() for panel in panels]
+    assert labels == [f"{name} [{unit}]" for name, unit in zip(
+        results.component_names(found.fits[0]), 3 * ["arcsec"] + 3 * ["rad/s"], strict=True)]  # fmt: skip
+    largest = [np.nanmax(np.abs(panel.lines[0].get_ydata())) for panel in panels]
+    factors = [formulas.ARCSEC] * 3 + [1.0] * 3
+    innovations, _ = results.innovations(found.fits[0])
+    np.testing.assert_allclose(largest, np.nanmax(np.abs(innovations), axis=0) * factors, rtol=1e-12)
+
+
 @pytest.mark.parametrize("samples", [11, 20, 60, 300])
 def test_the_verdict_on_short_logs_is_calibrated(samples):
     rng, wrong, detected = np.random.default_rng(samples), 0, 0

@@ -365,6 +365,16 @@ def quantiles_of_angles() -> list[Table]:
     return campaign_report.quantile_tables(examples.campaign(quantiles=quantiles))
 
 
+def identified(**changes: Any) -> Report:
+    """Return the report of an identified angle, and of a time without prior knowledge."""
+    angle = {"parameter": "attitude_noise", "estimate": 5e-5, "std": 1e-6, "lower": 4.8e-5, "upper": 5.2e-5,
+             "start": 4e-5, "prior_std": 2e-5, "unit": "rad"}  # fmt: skip
+    lag = {"parameter": "torque_lag", "estimate": 0.05, "std": 0.01, "lower": 0.03, "upper": 0.07, "start": 0.04,
+           "prior_std": math.inf, "unit": "s"}  # fmt: skip
+    results = {"parameters": [angle, lag], "gyro_bias": [], "logs": [], "validation": [], "verdict": [], **changes}
+    return reports.build("identify", {"status": "identified", **results}, "spacecraft")
+
+
 def approach(judged: bool) -> Report:
     """Return the report of a loop that is unstable at one sample of the approach phase."""
     left = dict.fromkeys(("gain_up", "gain_down", "phase", "delay", "peak_sensitivity"), 6.0)
@@ -427,6 +437,10 @@ OTHERS: dict[str, Callable[[], Any]] = {
     # the bound is 0 without noise, and None if no run reaches its end
     "angles of a campaign in arcsec and deg": quantiles_of_angles,
     "run without a lower bound": lambda: [text_of(run(None)), text_of(run(0.0))],
+    "identified parameters": identified,
+    "proposed manoeuvre": lambda: identified(status="designed", duration=300.0, undetermined=[], parameters=[
+        {"parameter": "attitude_noise", "value": 5e-5, "expected_std": 1e-6, "plain_std": math.inf, "unit": "rad"},
+    ]),
     "unstable sample of the approach phase": lambda: approach(judged=True),
     "unstable sample that is not judged": lambda: approach(judged=False),
     # a correlation of 0.15 is not significant in 200 trials, for example if only these settle

@@ -87,11 +87,14 @@ def identify_report(summary: Mapping[str, Any]) -> Report:
     summary = store.to_json_value(summary)
     if summary["status"] == "designed":
         return _design_report(summary)
-    estimates = [
-        (one["parameter"], f"{one['estimate']:.6g}", f"{one['std']:.2g}", f"{one['lower']:.5g} to {one['upper']:.5g}",
-         f"{one['start']:.6g}", format_number(one["prior_std"], ".2g", "none"), one["unit"] or "-")
-        for one in summary["parameters"]
-    ]  # fmt: skip
+    estimates, columns = [], ("estimate", "std", "lower", "upper", "start", "prior_std")
+    for one in summary["parameters"]:
+        unit, numbers = in_readable_unit(one["parameter"], one["unit"], *(one[column] for column in columns))
+        estimate, std, lower, upper, start, prior_std = numbers
+        estimates.append((
+            one["parameter"], f"{estimate:.6g}", f"{std:.2g}", f"{lower:.5g} to {upper:.5g}", f"{start:.6g}",
+            format_number(prior_std, ".2g", "none"), unit or "-",
+        ))  # fmt: skip
     for bias in summary["gyro_bias"]:
         for axis, value, std in zip("xyz", bias["estimate"], bias["std"], strict=True):
             name = f"gyro bias {axis} at the end of {bias['log']}"
@@ -116,11 +119,11 @@ def identify_report(summary: Mapping[str, Any]) -> Report:
 
 def _design_report(summary: Mapping[str, Any]) -> Report:
     """Return the report of `ptsmc identify --design`."""
-    columns = ("value", "expected_std", "plain_std")  # a 1 sigma may be infinite, None in the file
-    rows = [
-        (one["parameter"], *(format_number(one[key], ".3g", "none") for key in columns), one["unit"])
-        for one in summary["parameters"]
-    ]
+    rows = []
+    for one in summary["parameters"]:
+        numbers = one["value"], one["expected_std"], one["plain_std"]  # a 1 sigma may be infinite, None in the file
+        unit, shown = in_readable_unit(one["parameter"], one["unit"], *numbers)
+        rows.append((one["parameter"], *(format_number(number, ".3g", "none") for number in shown), unit))
     table = Table(
         ("parameter", "scenario", "expected 1 sigma", "after plain slews", "unit"), rows,
         "Plain slews: one about each axis, one after another, within the same limits and time.",
