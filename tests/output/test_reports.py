@@ -314,6 +314,15 @@ def pairs(count: int) -> Iterable[str]:
     return reports.map_lines(every[:count], ("loop.period", "controller.delta"), "spacecraft")
 
 
+def map_of(plant: str) -> Report:
+    """Return the report of a map with one pair that was simulated."""
+    head = ["loop.period", "controller.delta", "status", "failures", "not_converged", "window_error", "peak_torque",
+            "linear_window_error", "linear_torque", "hold_delay_margin", "gain_margin"]  # fmt: skip
+    pairs = [["0.1", "1.0", "simulated", "0", "0", "1e-05", "0.25", "5e-06", "0.01", "0.2", "2.0"],
+             ["0.1", "0.05", "not allowed", *([""] * 8)]]  # fmt: skip
+    return reports.map_report([head, *pairs], plant)
+
+
 def compared() -> Table:
     def law(failures: int, **changes: Any) -> dict[str, Any]:
         verdict = Requirement("peak_torque", 0.5).verdict(np.arange(1000) < failures, np.ones(1000, bool))
@@ -426,6 +435,8 @@ OTHERS: dict[str, Callable[[], Any]] = {
     "worst trials by an input": lambda: worst_trials("initial_w2"),
     "worst trials by a custom metric": lambda: worst_trials("mine", mine=[2.0, 1.0], settling_time=[None, 3]),
     "best pair of a map": lambda: pairs(4),
+    "map of a spacecraft": lambda: map_of("spacecraft"),
+    "map of a chain": lambda: map_of("chain"),
     "one pair of a map": lambda: pairs(1),
     "comparison of two laws": compared,  # 1.5e+03 times the lower bound are 1500
     "compliance of too few runs": compliance,

@@ -362,6 +362,7 @@ def test_required_margins_appear_in_table_csv_file_and_report(eight, tmp_path):
         assert "  gain_margin at least 6 dB: worst of 2 dispersed loops 5.04 dB: NOT met in 1 of 2 loops" in lines
         assert "  gain_margin at least 6 dB: no worst value: NOT met in 1 of 2 loops" in lines
         assert not [line for line in lines if "delay_margin" in line]
+        assert lines[-1] == "a trial has settled when its angle stays below 206 arcsec"
     assert "no law meets every requirement" in page.build(tmp_path / "out")
     assert not [line for line in lines_of(compare.summary(found)) if "interrupted" in line]
     cut_short = compare.summary(replace(found, interrupted=True))

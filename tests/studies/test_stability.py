@@ -37,7 +37,7 @@ def test_margins_command_writes_table_figures_and_page(command, tmp_path, plant)
     status, out, _ = command("margins", "s.toml")
     folder = tmp_path / "out" / "margins-s"
     assert status == 0
-    assert "gain up  down [dB]" in out
+    assert "gain up [dB]  gain down [dB]" in out
     assert out.startswith("The nominal loop is stable: gain ")
     assert {p.name for p in (folder / "figures").iterdir()} == {"nichols.png", "sensitivity.png", "margins.png"}
     found = json.loads((folder / "summary.json").read_text())

@@ -16,6 +16,7 @@ from tuning.output.formats import (
     format_count,
     format_named_error,
     format_number,
+    heading,
     in_readable_unit,
     list_counts,
 )
@@ -258,7 +259,7 @@ def worst_trial_table(frame: "pl.DataFrame", by: str, units: Mapping[str, str]) 
         if frame[name].dtype.is_float():
             unit, numbers = in_readable_unit(name, unit, *values)
             values = [format_number(number, ".5g") for number in numbers]
-        head.append(f"{name} [{unit}]" if unit.strip("-") else name)
+        head.append(heading(name, unit))
         cells.append(["-" if value is None else str(value) for value in values])
     return Table(tuple(head), list(zip(*cells, strict=True)))
 

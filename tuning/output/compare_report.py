@@ -8,7 +8,15 @@ from typing import Any
 
 from ptsmc_jax.formulas import ARCSEC, pointing_angle
 from ptsmc_jax.simulation.catalogues import MARGINS
-from tuning.output.formats import failed_counts, format_count, format_number, format_ratio, list_counts, ratio_to_bound
+from tuning.output.formats import (
+    failed_counts,
+    format_angle,
+    format_count,
+    format_number,
+    format_ratio,
+    list_counts,
+    ratio_to_bound,
+)
 from tuning.output.report import Block, Chart, Report, Section, Table, Text, warning_lines
 from tuning.output.summaries import Compare, Interval, Law, Number
 
@@ -252,7 +260,7 @@ def gain_lines(summary: Compare) -> Iterator[str]:
         for change, results in law.model_errors.items():
             if results["failures"]:
                 yield f"  {results['failures']} of {summary.trials} trials fail with {CHANGES[change]}"
-    yield f"a trial has settled when its angle stays below {summary.settling_angle:g} rad"
+    yield f"a trial has settled when its angle stays below {format_angle(summary.settling_angle)}"
 
 
 def most_accurate_law(laws: dict[str, Law]) -> str:

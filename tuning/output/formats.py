@@ -1,7 +1,6 @@
 """Numbers, units and counts as text."""
 
 import math
-import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -125,21 +124,13 @@ def format_metric(value: float, metric: str, plant: str) -> str:
     return format_angle(value) if unit == "rad" else f"{value:.3g} {unit}".rstrip(" -")
 
 
-def add_unit(name: str, plant: str) -> str:
-    """Return the name of a column of rows or of a map with its unit. Gain margins of a map are factors.
+def heading(name: str, unit: str) -> str:
+    """Return the heading of a column with its unit.
 
-    >>> add_unit("largest_peak_torque", "spacecraft"), add_unit("delay_margin", "chain"), add_unit("status", "chain")
-    ('largest_peak_torque [N m]', 'delay_margin [s]', 'status')
-    >>> add_unit("initial_angle", "spacecraft"), add_unit("initial_angle", "chain")
-    ('initial_angle [rad]', 'initial_angle [x1]')
+    >>> heading("delay_margin", "s"), heading("saturated", "-"), heading("status", "")
+    ('delay_margin [s]', 'saturated', 'status')
     """
-    from ptsmc_jax.simulation import catalogues  # imports JAX
-
-    units = catalogues.units(plant)
-    start = "rad" if plant == "spacecraft" else units["window_error"]  # of other plants the column has |x_1|
-    units |= {"torque": units["peak_torque"], "delay_margin": "s", "initial_angle": start}
-    unit = units.get(re.sub("^(linear|largest|hold)_(?=torque|peak|window|delay)", "", name), "-")
-    return name if unit == "-" else f"{name} [{unit}]"
+    return f"{name} [{unit}]" if unit.strip("-") else name
 
 
 def ratio_to_bound(value: float | None, bound: float | None) -> float | None:

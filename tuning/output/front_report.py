@@ -34,7 +34,6 @@ def result_table(front: Front) -> Table:
     """Return the table of errors and costs."""
     rows, plant = _labelled_points(front), front.plant
     costs = list(rows[0][1].costs) if rows else []
-    vector_heading = [f"RMS error vector [{unit_of('window_error', plant)}]"] if plant == "spacecraft" else []
     bound_heading = ["times the lower bound"] if front.lower_bound else []
     heads = [metric_heading(name, plant) for name in costs]
     cells = [
@@ -42,16 +41,13 @@ def result_table(front: Front) -> Table:
             label,
             format_error(point.rms, plant),
             relative_spread(point),
-            *(format_number(point.rms, ".3e") for _ in vector_heading),
             *(format_ratio(ratio_to_bound(point.rms, front.lower_bound)) for _ in bound_heading),
             *(format_number(point.costs[name], ".4g", "none" if name.endswith("margin") else "-") for name in costs),
             _describe_marks(point),
         )
         for label, point in rows
     ]
-    return Table(
-        (KINDS[front.against].label(plant), "RMS error", "+-", *vector_heading, *bound_heading, *heads, ""), cells
-    )
+    return Table((KINDS[front.against].label(plant), "RMS error", "+-", *bound_heading, *heads, ""), cells)
 
 
 def gain_table(front: Front) -> Table:

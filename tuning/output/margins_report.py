@@ -10,8 +10,8 @@ from tuning.output.summaries import Margins, Numbers, Row
 USUAL_MARGINS = {"gain_margin": 6.0, "phase_margin": 30.0}  # usual requirements [dB, deg]
 PHASES = {"hold": "hold phase", "before": "approach phase"}
 COLUMNS = {
-    "gain_up": "gain up",
-    "gain_down": "down [dB]",
+    "gain_up": "gain up [dB]",
+    "gain_down": "gain down [dB]",
     "phase": "phase [deg]",
     "delay": "delay [s]",
     "peak_sensitivity": "|S| [dB]",

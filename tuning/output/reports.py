@@ -1,17 +1,19 @@
 """The report of each command. Start with `build`. The longer reports have modules of their own."""
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from ptsmc_jax.campaigns import store
+from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.catalogues import CATALOGUES, without_norms
 from tuning.output import campaign_report, compare_report, front_report, margins_report, report, summaries, tune_report
 from tuning.output.formats import (
-    add_unit,
     format_error,
     format_metric,
     format_named_error,
     format_number,
+    heading,
     in_readable_unit,
     list_counts,
     parse_cell,
@@ -138,8 +140,10 @@ def map_report(rows: Sequence[Sequence[str]], plant: str) -> Report:
     head, *rows = rows
     pairs = [dict(zip(("x", "y", *head[2:]), map(parse_cell, row), strict=True)) for row in rows]
     headline, *lines = map_lines(pairs, (head[0], head[1]), plant)
-    cells = [tuple(_shorten_cell(cell) for cell in row) for row in rows]
-    table = Table(tuple(add_unit(name, plant) for name in head), cells, MAP_NOTE)
+    shown_head, *shown_rows = zip(
+        *(_map_column(*column, plant=plant) for column in zip(head, *rows, strict=True)), strict=True
+    )
+    table = Table(shown_head, shown_rows, MAP_NOTE)
     return Report(headline[0].upper() + headline[1:], "calm", lines, [Section("Pairs", [table])])
 
 
@@ -174,9 +178,16 @@ def _count_failures(pair: Mapping[str, Any]) -> float:
     return pair["failures"] + pair["not_converged"]
 
 
-def _shorten_cell(cell: str) -> str:
-    value = parse_cell(cell)
-    return cell if isinstance(value, str) or not cell else format_number(value, ".4g", "")
+def _map_column(name: str, *cells: str, plant: str) -> tuple[str, ...]:
+    """Return a column of map.csv with a readable unit in its heading. Gain margins of a map are factors."""
+    values = [parse_cell(cell) for cell in cells]
+    if any(isinstance(value, str) for value in values):
+        return name, *cells
+    metric = re.sub("^(linear|largest|hold)_(?=torque|peak|window|delay)", "", name)
+    units = catalogues.units(plant)
+    unit = {**units, "torque": units["peak_torque"], "delay_margin": "s"}.get(metric, "-")
+    unit, numbers = in_readable_unit(metric, unit, *values)
+    return heading(name, unit), *(format_number(number, ".4g", "") for number in numbers)
 
 
 REPORTS: dict[str, Callable[[Mapping[str, Any], str], Report]] = {
