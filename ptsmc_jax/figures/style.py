@@ -13,8 +13,8 @@ from matplotlib.axis import Axis, XAxis
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from ptsmc_jax.formulas import ARCSEC, pointing_angle
-from ptsmc_jax.simulation.catalogues import CATALOGUES
+from ptsmc_jax.formulas import ARCSEC
+from ptsmc_jax.simulation.catalogues import CATALOGUES, as_angle
 
 # colours of Okabe and Ito, distinct for the colour-blind; line styles are distinct in grey
 STYLES = (("#0072B2", "-"), ("#D55E00", "--"), ("#009E73", "-."), ("#000000", ":"), ("#CC79A7", (0, (5, 1, 1, 1))))
@@ -68,9 +68,17 @@ class _DecadeLocator(matplotlib.ticker.LogLocator):
 
 def error_display(plant: str) -> tuple[Callable[[ArrayLike], np.ndarray], str, str]:
     """Return how figures show the error of a kind of plant: a function of its norm, its name and the unit."""
-    if plant == "spacecraft":
-        return lambda error: ARCSEC * pointing_angle(error), "pointing error", "arcsec"
-    return np.asarray, "error", CATALOGUES[plant]["window_error"].unit
+    convert, unit = metric_display("window_error", plant)
+    return convert, "pointing error" if plant == "spacecraft" else "error", unit
+
+
+def metric_display(metric: str, plant: str) -> tuple[Callable[[ArrayLike], np.ndarray], str]:
+    """Return how figures show a metric of a kind of plant: a function of its values, and the unit."""
+    stated_unit = CATALOGUES[plant][metric].unit
+    unit, _ = as_angle(metric, stated_unit, 0.0)
+    if unit == "rad":
+        return lambda values: ARCSEC * np.asarray(as_angle(metric, stated_unit, values)[1]), "arcsec"
+    return np.asarray, unit
 
 
 def plain_ticks(line: Axis) -> None:

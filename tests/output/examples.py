@@ -48,8 +48,8 @@ def law(**changes: Any) -> dict[str, Any]:
     """Return a law of a comparison without numbers."""
     numbers = ("window_error", "window_error_interval", "lower_bound", "peak_torque", "largest_peak_torque", "effort",
                "chattering", "settling_time", "settling_near_far", "margins")  # fmt: skip
-    return {**dict.fromkeys(numbers), "gains": {}, "at_bound": {}, "met": True, "counts": {"ok": 8}, "unsettled": 0,
-            "model_errors": {}, "verdicts": [], **changes}  # fmt: skip
+    return {**dict.fromkeys(numbers), "gains": {}, "gain_units": {}, "at_bound": {}, "met": True,
+            "counts": {"ok": 8}, "unsettled": 0, "model_errors": {}, "verdicts": [], **changes}  # fmt: skip
 
 
 def compare(laws: dict[str, Any], **changes: Any) -> summaries.Compare:

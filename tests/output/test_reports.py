@@ -179,6 +179,9 @@ TUNINGS: dict[str, Callable[[], Any]] = {
     "less accurate than gains that break limits": lambda: accuracy(
         0.08, **SCALED, broken_by={"published": ["gain_margin", "effort"]}
     ),
+    "tuned gains with their units": lambda: accuracy(
+        None, gains={"eta": 3.0, "observer_gain_2": 0.5}, gain_units={"eta": "-", "observer_gain": "N m s"}
+    ),
     "more accurate than the paper's law": lambda: accuracy(40.0, published_label="paper's law"),
     "all held-out trials fail": lambda: accuracy(
         0.08, held_out=examples.group(counts={"ok": 0, "not_converged": 60, "diverged": 4})
@@ -554,15 +557,18 @@ def test_driver_explains_a_significant_part_of_the_variance(correlation, trials,
 
 
 @pytest.mark.parametrize(
-    ("plant", "shown", "title"),
+    ("plant", "objective", "shown", "title"),
     [
-        ("spacecraft", np.degrees(2.0 * np.arcsin(1e-5)) * 3600.0, "rms pointing error [arcsec]"),
-        ("chain", 1e-5, "rms error [x1]"),
+        ("spacecraft", "rms_window_error", np.degrees(2.0 * np.arcsin(1e-5)) * 3600.0, "rms pointing error [arcsec]"),
+        ("spacecraft", "rms_hold_angle", np.degrees(1e-5) * 3600.0, "rms hold angle [arcsec]"),
+        ("spacecraft", "mean_peak_torque", 1e-5, "mean peak torque [N m]"),
+        ("chain", "rms_window_error", 1e-5, "rms error [x1]"),
+        ("chain", "objective_t_f", 1e-5, "objective t f [s]"),
     ],
 )
-def test_chart_of_a_search_shows_the_error_in_the_unit_of_the_figures(plant, shown, title):
-    rows = [{"step": "0", "start": "0", "rms_window_error": "1e-05", "eta": "3"}]
-    chart = page_charts.search(rows, "rms_window_error", plant)
+def test_chart_of_a_search_shows_the_objective_in_the_unit_of_the_figures(plant, objective, shown, title):
+    rows = [{"step": "0", "start": "0", objective: "1e-05", "eta": "3"}]
+    chart = page_charts.search(rows, objective, plant)
     assert chart["data"][0]["y"] == pytest.approx([shown], rel=1e-5)  # with six digits
     assert chart["layout"]["yaxis"]["title"]["text"] == title
 

@@ -15,6 +15,7 @@ from tuning.output.formats import (
     format_number,
     format_ratio,
     list_counts,
+    list_gains,
     ratio_to_bound,
 )
 from tuning.output.report import Block, Chart, Report, Section, Table, Text, warning_lines
@@ -245,7 +246,7 @@ def gain_lines(summary: Compare) -> Iterator[str]:
     if summary.published_unavailable:
         yield f"the published gains cannot be simulated in this scenario: {summary.published_unavailable}"
     for name, law in summary.laws.items():
-        gains = ", ".join(f"{gain} {value:.4g}" for gain, value in law.gains.items())
+        gains = list_gains(law.gains, law.gain_units, ".4g")
         bound = "".join(f"; {gain} on its {side} bound" for gain, side in law.at_bound.items())
         scaled = (
             ", scaled to this body and period"

@@ -100,14 +100,32 @@ def format_named_error(value: float | None, plant: str, statistic: str = "") -> 
 
 
 def format_objective(name: str, value: float, plant: str) -> str:
-    """Return an objective with its name, a window error as a pointing angle.
+    """Return an objective with its name and unit, a window error as a pointing angle.
 
     >>> format_objective("RMS window error", 1e-6, "spacecraft"), format_objective("t_f", 30.0, "chain")
-    ('RMS pointing error 0.413 arcsec', 't_f 30')
+    ('RMS pointing error 0.413 arcsec', 't_f 30 s')
+    >>> (
+    ...     format_objective("mean effort", 2.0, "spacecraft"),
+    ...     format_objective("largest metric over its limit", 0.9, "chain"),
+    ... )
+    ('mean effort 2 N m s', 'largest metric over its limit 0.9')
     """
-    if name.endswith("window error"):
-        return f"{name.removesuffix('window error')}{error_name(plant)} {format_error(value, plant)}"
-    return f"{name} {value:.4g}"
+    metric = objective_metric(name, plant)
+    if not metric:
+        return f"{name} {value:.4g}{' s' if name == 't_f' else ''}"
+    return f"{name.replace('window error', error_name(plant))} {format_metric(value, metric, plant)}"
+
+
+def objective_metric(name: str, plant: str) -> str:
+    """Return the metric of an objective, from its name or its column in a file; "" if it is no metric.
+
+    >>> objective_metric("90 % quantile of effort", "chain"), objective_metric("rms_window_error", "chain")
+    ('effort', 'window_error')
+    """
+    from ptsmc_jax.simulation.catalogues import CATALOGUES  # imports JAX
+
+    words = name.replace(" ", "_")
+    return max((metric for metric in CATALOGUES[plant] if words.endswith(metric)), key=len, default="")
 
 
 def format_metric(value: float, metric: str, plant: str) -> str:
@@ -131,6 +149,19 @@ def heading(name: str, unit: str) -> str:
     ('delay_margin [s]', 'saturated', 'status')
     """
     return f"{name} [{unit}]" if unit.strip("-") else name
+
+
+def list_gains(gains: Mapping[str, float], units: Mapping[str, str], digits: str) -> str:
+    """Return gains with their units in one line.
+
+    >>> list_gains({"eta": 3.0, "observer_gain_1": 0.5}, {"eta": "-", "observer_gain": "N m s"}, ".4g")
+    'eta 3, observer_gain_1 0.5 N m s'
+    """
+    from ptsmc_jax.simulation.gains import base  # imports JAX
+
+    return ", ".join(
+        f"{name} {value:{digits}} {units.get(base(name), '')}".rstrip(" -") for name, value in gains.items()
+    )
 
 
 def ratio_to_bound(value: float | None, bound: float | None) -> float | None:

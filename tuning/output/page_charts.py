@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 
 from ptsmc_jax.figures import animation
-from ptsmc_jax.figures.style import STYLES, error_display
+from ptsmc_jax.figures.style import STYLES, error_display, metric_display
+from tuning.output.formats import error_name, heading, objective_metric
 from tuning.studies.front import Front, Point, unit_of
 
 Chart = dict[str, Any]
@@ -208,13 +209,14 @@ def search(rows: Sequence[Mapping[str, str]], objective: str, plant: str) -> Cha
 
     Args:
         rows: the rows of `history.csv`, by column.
-        objective: column of the objective. The window error of a spacecraft is shown as a pointing angle.
+        objective: column of the objective, in the unit of the figures.
         plant: kind of the plant.
     """
-    title, convert = objective, np.asarray
-    if objective.endswith("window_error"):
-        convert, name, unit = error_display(plant)
-        title = f"{objective.removesuffix('window_error')}{name} [{unit}]"
+    convert, unit = np.asarray, "s" if objective.endswith("t_f") else ""
+    metric = objective_metric(objective, plant)
+    if metric:
+        convert, unit = metric_display(metric, plant)
+    title = heading(objective.replace("window_error", error_name(plant)), unit)
     starts: dict[str, list[Mapping[str, str]]] = {}
     for row in rows:
         starts.setdefault(row["start"], []).append(row)

@@ -135,6 +135,7 @@ class Law(msgspec.Struct, frozen=True, kw_only=True):
     """The gains and results of one law of a comparison."""
 
     gains: dict[str, float]
+    gain_units: dict[str, str]
     at_bound: dict[str, str]
     met: bool
     counts: dict[str, int]

@@ -99,7 +99,7 @@ def accuracy_lines(summary: Tune) -> Iterator[str]:
             yield f"{name} trials: {format_error(statistics['rms'], plant)}{spread}{compared}"
     yield from _published_comparison(summary)
     if summary.gains:
-        yield f"tuned gains: {', '.join(f'{name} {value:.6g}' for name, value in summary.gains.items())}"
+        yield f"tuned gains: {formats.list_gains(summary.gains, summary.gain_units, '.6g')}"
     saturated = held_out.metrics.get("saturated")
     if saturated and saturated["max"] and saturated["mean"] is not None:
         saturation = f"{percent(saturated['mean'])} % of a trial on average, {percent(saturated['max'])} % at most"

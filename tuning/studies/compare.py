@@ -291,6 +291,7 @@ def contender_results(contender: Contender) -> dict[str, Any]:
             for name in ("peak_torque", "effort", "chattering")}  # fmt: skip
     return {
         "gains": contender.gains,
+        "gain_units": gains.units_of(contender.simulated),
         "at_bound": contender.at_bound,
         "met": contender.met,
         "counts": trials.counts(),

@@ -254,9 +254,10 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
         return np.stack([[value(path[k]) if k < len(path) else padding for path in paths] for k in range(longest)])
 
     minimised, to_unit = scenario.search.minimise, np.asarray
-    unit = {T_F: "s", LIMITS: "-", **catalogues.units(kind)}[minimised]
-    if minimised == "window_error":
-        to_unit, _, unit = style.error_display(kind)
+    if minimised in (T_F, LIMITS):
+        unit = {T_F: "s", LIMITS: "-"}[minimised]
+    else:
+        to_unit, unit = style.metric_display(minimised, kind)
     objective = f"{objective_name(scenario.search).replace(' window', chr(10) + 'window')} [{unit}]"
     gains = over_steps(lambda step: step.gains)
     figures: dict[str, Any] = {
