@@ -101,11 +101,16 @@ class Verdict:
 
     @property
     def word(self) -> str:
-        """The verdict as text: "met", "NOT met", or "NOT shown" if there are too few trials to verify the quantile."""
+        """The verdict as text: "met", "NOT met" or "NOT shown".
+
+        "NOT shown": the required fraction of the trials keeps the limit, but there are too few trials for the
+        confidence.
+        """
         if self.met:
             return "met"
         too_few = must_keep(self.trials, self.quantile, self.confidence) is None
-        return "NOT shown" if too_few and self.interpretation != "temporal" else "NOT met"
+        is_kept = replace(self, confidence=None, shown=self.fraction_of_time).met
+        return "NOT shown" if too_few and is_kept else "NOT met"
 
     @classmethod
     def read(cls, entry: Mapping[str, Any]) -> "Verdict":
@@ -151,10 +156,10 @@ class Verdict:
             loop_count = f"of {trials} dispersed loops " if noun == "loops" else ""
             result = (f"worst {loop_count}" if trials > 1 else "") + quantity(worst, self.unit, 4, self.metric)
         least = must_keep(trials, self.quantile, self.confidence)
-        if least is None and self.quantile is not None and self.confidence is not None:
-            reason = f", which takes at least {fewest_trials(self.quantile, self.confidence)} trials"
-        elif self.met:
+        if self.met:
             reason = f", beyond it {failures} of {trials} {noun}" if failures else ""
+        elif self.word == "NOT shown" and self.quantile is not None and self.confidence is not None:
+            reason = f", which takes at least {fewest_trials(self.quantile, self.confidence)} trials"
         else:
             allowed = f", at most {trials - least} allowed" if least is not None and trials > least else ""
             reason = f" in {failures} of {trials} {noun}{allowed}" if trials > 1 else ""
