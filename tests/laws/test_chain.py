@@ -14,8 +14,9 @@ from ptsmc_jax.laws.prescribed_time import surface_coefficients
 from ptsmc_jax.plants import integrator_chain
 from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation import rollout
-from ptsmc_jax.theory import envelopes, hold, solutions
+from ptsmc_jax.theory import envelopes, solutions
 from tests.helpers import chain_parts, commanded, drawn, fly, short, vector, with_controller
+from tests.theory import hold_phase
 
 torque = jax.jit(commanded)
 HOLD, BEFORE = jnp.asarray(True), jnp.asarray(False)
@@ -202,8 +203,8 @@ def check_envelopes(n, case):
     largest = 1e-7 * np.abs(log.x).max(axis=0) + 1e-12
     assert np.all(np.abs(log.x[: t.size] - centre) <= half * (1 + 1e-6) + largest)
     t = log.t[t.size :]
-    assert np.all(np.abs(log.s[-t.size :, 0]) <= hold.sliding_bound(run, t) * (1 + 1e-6) + rounding)
-    assert np.all(np.abs(log.x[-t.size :, 0]) <= hold.error_bound(run, t) * (1 + 1e-6) + largest[0])
+    assert np.all(np.abs(log.s[-t.size :, 0]) <= hold_phase.sliding_bound(run, t) * (1 + 1e-6) + rounding)
+    assert np.all(np.abs(log.x[-t.size :, 0]) <= hold_phase.error_bound(run, t) * (1 + 1e-6) + largest[0])
 
 
 test_chain_of_order_3_is_inside_its_envelopes = drawn(check_envelopes, 15, n=st.just(3), case=SCENARIO)

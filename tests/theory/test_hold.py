@@ -11,8 +11,9 @@ from ptsmc_jax import formulas
 from ptsmc_jax.laws.kinematics import AdditiveKinematics, MultiplicativeKinematics
 from ptsmc_jax.signals import disturbances, references
 from ptsmc_jax.simulation import clock, rollout
-from ptsmc_jax.theory import envelopes, hold, solutions
+from ptsmc_jax.theory import envelopes, solutions
 from tests.helpers import FULL_INERTIA, chain_parts, fly, parts, short, vector
+from tests.theory import hold_phase
 
 QUIET = disturbances.Sinusoid(*[jnp.zeros(3)] * 4)
 AWAY = vector(0.4, -0.3, 0.2, np.sqrt(1 - 0.29))
@@ -42,7 +43,9 @@ def exact(run, t):
 
     def component(x0):
         at = solutions.exact_chain(law.hand_over, law.t_f, law.eta, x0).x
-        moved = jax.vmap(lambda time: hold.exact_hold(time, law.surface(), law.reaching_rate, at))(t - law.hand_over)
+        moved = jax.vmap(lambda time: hold_phase.exact_hold(time, law.surface(), law.reaching_rate, at))(
+            t - law.hand_over
+        )
         return moved.x[:, 0], moved.s, moved.acceleration
 
     return jax.vmap(component, out_axes=1)(solutions.initial_errors(run))
@@ -79,7 +82,7 @@ def test_order_two_equals_the_explicit_formula(c, k):
     s = x_dot + c * x
     between = t * np.exp(-c * t) if abs(c - k) < 1e-6 else (np.exp(-k * t) - np.exp(-c * t)) / (c - k)
     for time, expected in zip(t, np.exp(-c * t) * x + s * between, strict=True):
-        found = hold.exact_hold(vector(time), vector([c]), vector(k), vector([x, x_dot]))
+        found = hold_phase.exact_hold(vector(time), vector([c]), vector(k), vector([x, x_dot]))
         np.testing.assert_allclose(found.x[0], expected, rtol=1e-7 if 0 < abs(c - k) < 1e-6 else 1e-12, atol=1e-14)
         np.testing.assert_allclose(found.s, s * np.exp(-k * time), rtol=1e-12, atol=1e-14)
         np.testing.assert_allclose(
@@ -126,8 +129,8 @@ def test_hold_envelopes_are_within_a_factor_of_ten():
     log = fly(run).log
     t = log.t[log.t >= 8.0]
     for size, bound in (
-        (np.abs(log.s[-t.size :, 0]), hold.sliding_bound(run, t)),
-        (np.abs(log.x[-t.size :, 0]), hold.error_bound(run, t)),
+        (np.abs(log.s[-t.size :, 0]), hold_phase.sliding_bound(run, t)),
+        (np.abs(log.x[-t.size :, 0]), hold_phase.error_bound(run, t)),
     ):
         ratio = size / bound
         assert 0.1 < ratio[-1] <= ratio.max() <= 1.0
@@ -137,7 +140,7 @@ def test_squared_envelope_of_s_decays_to_the_residual_of_the_smooth_sign():
     """The limit is 0.2785 K width / k. Half of the way is reached after ln 2 / (2 k)."""
     bound, width, k = 0.02, 0.1, 0.7
     run = chain_parts([1.0, -0.5], 10.0, 3.0, 2.0, k1=k, bound=bound, sign_width=width)
-    first, half, last = hold.sliding_bound(run, 8.0 + np.array([0.0, np.log(2.0) / (2.0 * k), 1e3])) ** 2
+    first, half, last = hold_phase.sliding_bound(run, 8.0 + np.array([0.0, np.log(2.0) / (2.0 * k), 1e3])) ** 2
     assert first > 2.0 * last
     np.testing.assert_allclose(last, 0.2785 * bound * width / k, rtol=1e-9)
     np.testing.assert_allclose(half, (first + last) / 2.0, rtol=1e-9)

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from ptsmc_jax.observers.base import NoObserver
 from ptsmc_jax.signals import disturbances, references
 from ptsmc_jax.simulation import clock, rollout
-from ptsmc_jax.theory import envelopes, hold, rules, solutions
+from ptsmc_jax.theory import envelopes, rules, solutions
 from tests.helpers import (
     FULL_INERTIA,
     PAPER_ATTITUDE,
@@ -23,6 +23,7 @@ from tests.helpers import (
     vector,
     with_controller,
 )
+from tests.theory import hold_phase
 
 # no disturbance, as a sinusoid of amplitude 0, to share a compiled program
 QUIET = disturbances.Sinusoid(*[vector([0.0] * 3)] * 4)
@@ -180,8 +181,8 @@ def stays_inside_the_corrected_bounds(case):
     # in the hold phase the integration error is (2 0.06)^5 / 120 of the decaying part, in 400 steps of at most 0.06 s
     later, t = ~before, log.t[~before]
     size, error = (np.linalg.norm(v[later], axis=1) for v in (log.s, log.error))
-    assert np.all(size <= hold.sliding_bound(run, t) * (1 + 1e-4) + 1e-9)
-    assert np.all(error <= hold.error_bound(run, t) * (1 + 1e-4) + 1e-9)
+    assert np.all(size <= hold_phase.sliding_bound(run, t) * (1 + 1e-4) + 1e-9)
+    assert np.all(error <= hold_phase.error_bound(run, t) * (1 + 1e-4) + 1e-9)
 
 
 test_spacecraft_stays_inside = drawn(stays_inside_the_corrected_bounds, 12, case=SPACECRAFT)

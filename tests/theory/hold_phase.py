@@ -1,4 +1,4 @@
-"""Exact motion, and envelopes of s and of the error, in the hold phase (after the hand-over), for every order.
+"""Exact motion, and envelopes of s and of the error, in the hold phase, with which tests compare simulated runs.
 
 Read `exact_hold` first. "Exact" means a perfect disturbance estimate and K2 = 0. The envelopes hold for the continuous
 loop without noise.
@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from ptsmc_jax import programs
 from ptsmc_jax.formulas import surface_roots
 from ptsmc_jax.numerics import guards, integrators
 from ptsmc_jax.numerics.pytrees import Scalar
@@ -101,7 +100,7 @@ def _hand_over_bounds(parts: Parts) -> tuple[Array, Array, Array, Array]:
     return *_bounds_at_hand_over(parts, *map(jnp.asarray, envelopes.sliding_envelope(parts))), limit
 
 
-@programs.jit
+@jax.jit
 def _bounds_at_hand_over(parts: Parts, s0: Scalar, residual_before: Scalar) -> tuple[Array, Array, Array]:
     law = parts.controller
 
@@ -113,7 +112,7 @@ def _bounds_at_hand_over(parts: Parts, s0: Scalar, residual_before: Scalar) -> t
     return centre, half, jnp.abs(centre @ weights) + half @ jnp.abs(weights)
 
 
-@programs.jit
+@jax.jit
 def _error_bound(
     parts: Parts, centre: Array, half: Array, s_bound: Array, s_limit: Array, lags: Vector, t: Array
 ) -> Array:
