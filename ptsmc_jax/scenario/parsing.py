@@ -4,6 +4,7 @@ This module validates single tables and keys. `checks` validates constraints bet
 """
 
 import copyreg
+import decimal
 import difflib
 import functools
 import math
@@ -12,6 +13,7 @@ import re
 import tomllib
 import typing
 from collections.abc import Iterable, Mapping
+from decimal import Decimal
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,6 +41,7 @@ LONGEST_KEY = 100  # largest number of characters of a key
 MOST_LISTED = 20  # largest number of known names that an error lists
 TABLES_OF_NAMES = ("telemetry", "dispersion")  # tables whose keys have the names of other things
 _TOO_DEEP = f"but at most {DEEPEST} levels are allowed"
+_DECIMAL = decimal.Context(traps=[])  # an overflow gives infinity, which is refused later
 # a very long dotted key: the memory that the parser needs for it grows with the square of its length
 _LONG_DOTTED_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){20}""")
 
@@ -408,7 +411,10 @@ def _to_numbers(value: Any, units: Mapping[str, float]) -> Any:
         value = value.tolist()
     if isinstance(value, str):
         match = re.fullmatch(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?) ?(.*)", " ".join(value.split()))
-        return float(match[1]) * units[match[2]] if match and match[2] in units else value
+        if match is None or match[2] not in units:
+            return value
+        # the nearest double: 20 * 1e-6 in floating point is not 2e-5
+        return float(_DECIMAL.multiply(_DECIMAL.create_decimal(match[1]), Decimal(str(units[match[2]]))))
     return tuple(_to_numbers(one, units) for one in value) if isinstance(value, list | tuple) else value
 
 

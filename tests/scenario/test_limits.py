@@ -9,6 +9,7 @@ import pytest
 from ptsmc_jax import scenario
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.scenario import parsing
+from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Limit
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.requirements import Requirement, violation_ratio
@@ -68,6 +69,20 @@ def test_a_number_can_be_text_with_a_unit(table, key, said, value):
     assert scenario.from_tables(parsing.dump(read)) == read
     other = scenario.replace(scenario.from_tables({"loop": SAMPLED}), **{f"{table}__{key}": said})
     assert getattr(getattr(other, table), key) == getattr(getattr(read, table), key)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"), [("20 uN m", 2e-5), ("0.3 uN m", 3e-7), ("7.2 mN m", 7.2e-3), ("9e3 uNm", 9e-3)]
+)
+def test_a_number_with_a_unit_is_the_nearest_number_in_si_units(text, value):
+    read = scenario.from_tables({"requirements": {"peak_torque": text}})
+    assert parsing.dump(read)["requirements"] == {"peak_torque": value}
+
+
+@pytest.mark.parametrize("exponent", ["400", "9" * 30])
+def test_a_number_with_a_unit_that_overflows_is_refused(exponent):
+    with pytest.raises(ScenarioError, match="inf is no finite number"):
+        scenario.from_tables({"requirements": {"peak_torque": f"1e{exponent} uN m"}})
 
 
 @pytest.mark.parametrize(
