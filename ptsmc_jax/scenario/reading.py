@@ -70,7 +70,9 @@ def resolve(scenario: Scenario) -> Scenario:
     if scenario.loop.window is None and scenario.sampled:
         loop = msgspec.structs.replace(loop, window=max(loop.window, loop.period))
     if loop.t_end is None:
-        loop = msgspec.structs.replace(loop, t_end=law.t_f + max(ratios.scaled_value(TIME_AFTER_T_F), loop.window))
+        pointing = getattr(tables.get("pointing"), "time_after_t_f", 0.0)
+        after = max(ratios.scaled_value(TIME_AFTER_T_F), loop.window, pointing)
+        loop = msgspec.structs.replace(loop, t_end=law.t_f + after)
     scenario = msgspec.structs.replace(scenario, **{**tables, "loop": loop})
     checks.check_sensors(scenario)
     scenario.check_devices()

@@ -58,7 +58,7 @@ class Loop(Table, frozen=True):
     t_end: Annotated[
         ResolvedPositive,
         Meaning(
-            "end of the run; default: 4/3 t_f or the end of the window for a spacecraft, 3 t_f for other plants", "s"
+            "end of the run; default: 4/3 t_f or the end of the windows for a spacecraft, 3 t_f for other plants", "s"
         ),
     ] = ABSENT
     window: Annotated[
