@@ -271,7 +271,7 @@ class PrescribedTimeChain(PrescribedTimeLaw):
         if not self.eta > order:
             return "eta", f"greater than plant.order, {order} ({'Theorem 1' if order == 2 else 'Theorem 3'})"
         if len(self.a) != order - 1:
-            return "a", f"a list of plant.order - 1 = {order - 1} numbers"
+            return "a", f"a list of plant.order - 1 = {order - 1} number{'s' * (order > 2)}"
         stable = "such that all roots of p^(n-1) + a_(n-1) p^(n-2) + .. + a_1 are stable (39)"
         return None if formulas.is_hurwitz(self.a) else ("a", stable)
 

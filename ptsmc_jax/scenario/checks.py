@@ -194,7 +194,7 @@ def _check_dispersion(scenario: Scenario) -> None:
         key, state_count = random["x0"].width_key, len(scenario.plant.x0)
         value = getattr(random["x0"], key)
         if len(value) != state_count:
-            raise wrong(f"dispersion.x0.{key}", value, f"a list of {state_count} numbers, one for each state")
+            raise wrong(f"dispersion.x0.{key}", value, errors.list_of(state_count, "state in plant.x0"))
 
 
 def _absent_needs(scenario: Scenario) -> dict[str, str]:

@@ -88,10 +88,11 @@ class Actuators(Table, frozen=True):
             raise wrong("hardware.torque_step", step, allowed)
         wheels = scenario.reaction_wheels
         channels = scenario.inputs if wheels is None else len(wheels.spin_axes())
-        for key in ("actuator_scale", "actuator_misalignment_deg"):
+        each = "wheel" if wheels is not None else "axis" if scenario.motion == "spacecraft" else "input"
+        for key, entry in (("actuator_scale", "number"), ("actuator_misalignment_deg", "row")):
             value = getattr(self, key, None)
             if value is not None and len(value) != channels:
-                raise wrong(f"hardware.{key}", value, f"a list of {channels}, {ONE_FOR_EACH}")
+                raise wrong(f"hardware.{key}", value, errors.list_of(channels, each, entry))
 
     def noise_of_error(self, scenario: Any) -> tuple[float, float]:
         """Return the noise of the error and of its rate [1/s], 1 sigma per axis and raw sample."""
@@ -258,7 +259,7 @@ class StateHardware(Actuators, frozen=True):
         super().check(scenario)
         states = len(scenario.plant.x0)
         if self.state_noise is not None and len(self.state_noise) != states:
-            raise wrong("hardware.state_noise", self.state_noise, f"a list of {states} numbers, one for each state")
+            raise wrong("hardware.state_noise", self.state_noise, errors.list_of(states, "state in plant.x0"))
 
     def noise_of_error(self, scenario: Any) -> tuple[float, float]:
         """Return the noise of the first state and of its derivative; for a system, of the noisiest components."""
@@ -381,7 +382,7 @@ class WheelLimits(Table, frozen=True):
         except ValueError as error:
             raise errors.value_error(f"wheels.{self.axes_key}", getattr(self, self.axes_key), f": {error}") from None
         if self.momentum is not None and len(self.momentum) != len(axes):
-            raise wrong("wheels.momentum", self.momentum, f"a list of {len(axes)} numbers, one for each wheel")
+            raise wrong("wheels.momentum", self.momentum, errors.list_of(len(axes), "wheel"))
         limit = self.momentum_limit
         if limit is not None and any(abs(h) > limit for h in self.momentum or ()):
             raise wrong("wheels.momentum", self.momentum, f"within wheels.momentum_limit, {limit}")

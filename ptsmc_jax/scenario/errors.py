@@ -53,6 +53,13 @@ def value_error(key: str, value: Any, reason: str, allowed: str = "") -> Scenari
     return ScenarioError(f"{key} is {brief(value)}{reason}", key=key, value=value, allowed=allowed)
 
 
+def list_of(count: int, each: str, entry: str = "number") -> str:
+    """Return the text of a list of fixed length, such as "a list of 3 numbers, one for each axis"."""
+    if count == 1:
+        return f"a list with one {entry}, since there is one {each}"
+    return f"a list of {count} {entry}s, one for each {each}"
+
+
 def brief(value: Any) -> str:
     """Return the text of a value for an error message, cut after `LONGEST_VALUE` characters."""
     shown = show(value)

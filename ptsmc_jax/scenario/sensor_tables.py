@@ -18,7 +18,7 @@ from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.scenario import attitude_keys
 from ptsmc_jax.scenario.custom import custom_kind
 from ptsmc_jax.scenario.device_tables import Hardware
-from ptsmc_jax.scenario.errors import ScenarioError, wrong
+from ptsmc_jax.scenario.errors import ScenarioError, list_of, wrong
 from ptsmc_jax.scenario.schema import PartTable
 from ptsmc_jax.scenario.values import Kinds, Meaning, NotNegative, Positive, Table, Three
 
@@ -186,7 +186,7 @@ class CustomTable(AttitudeSensorTable, frozen=True):
         reading = sensor.read(jnp.array([0.0, 0.0, 0.0, 1.0]))
         component_count = np.size(sensor.change(reading, reading))
         if component_count != len(self.sigmas()):
-            raise wrong("sensors.noise", self.noise, f"a list of {component_count} numbers, one for each component")
+            raise wrong("sensors.noise", self.noise, list_of(component_count, "component"))
         return sensor
 
 

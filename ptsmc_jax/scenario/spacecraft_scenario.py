@@ -113,7 +113,8 @@ class Flexible(Table, frozen=True):
         modes = sorted(map(len, lists.values()))[1]  # the length that two of the three lists have
         for key, value in lists.items():
             if len(value) != modes:
-                raise wrong(f"flexible.{key}", value, f"a list of {modes}, one for each mode")
+                others = (f"flexible.{other} ({len(one)})" for other, one in lists.items() if other != key)
+                raise wrong(f"flexible.{key}", value, f"as long as {' and '.join(others)}, one entry for each mode")
         try:
             formulas.rest_inertia(formulas.check_inertia(inertia), self.coupling)
         except ValueError as error:

@@ -115,7 +115,7 @@ class StateScenario(Scenario, frozen=True, kw_only=True):
             for key in table.keys_per_input:
                 value = getattr(table, key)
                 if value is not None and len(value) != m:
-                    raise wrong(f"{place}.{key}", value, f"a list of {m} number{'s' * (m > 1)}, one for each input")
+                    raise wrong(f"{place}.{key}", value, errors.list_of(m, "input"))
 
     def initial_state(self) -> Any:
         """Return the state x0."""
