@@ -24,7 +24,7 @@ from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.scenario import errors
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.schema import PartTable, make_table
-from ptsmc_jax.scenario.values import Count, Kinds, Meaning, NotNegative, NotNegatives, Positive, Table, Three
+from ptsmc_jax.scenario.values import Kinds, Meaning, NotNegative, NotNegatives, Positive, Table, Three
 
 ONE_FOR_EACH = "one for each axis, wheel or input"
 PositiveEach = Annotated[
@@ -61,7 +61,7 @@ class Actuators(Table, frozen=True):
     torque_lag: Annotated[Positive | None, Meaning("time constant of a first-order lag", "s")] = None
     torque_step: Annotated[Positive | None, Meaning("quantisation of torque or input", "unit of u")] = None
     delay: Annotated[
-        Annotated[int, Meta(ge=0, description="a whole number, at least 0")] | None,
+        Annotated[int, Meta(ge=0, description="a whole number of control periods, at least 0")] | None,
         Meaning(
             "control periods from the measurement to the torque, the same for all sensors. It also delays"
             " the compensation of the wheels' momentum. The observer uses the delayed torque. The law "
@@ -141,7 +141,8 @@ class Hardware(Actuators, frozen=True):
     ] = None
     rate_bias_walk: Annotated[NotNegative | None, Meaning("random walk of the bias", "rad/s/sqrt(s)")] = None
     star_tracker_every: Annotated[
-        Count | None, Meaning("control periods between star tracker samples, with a filter")
+        Annotated[int, Meta(ge=1, description="a whole number of control periods, at least 1")] | None,
+        Meaning("control periods between star tracker samples, with a filter"),
     ] = None
     star_tracker_period: Annotated[
         Positive | None,
@@ -397,7 +398,7 @@ class PyramidWheels(WheelLimits, frozen=True):
 
     kind: Literal["pyramid"] = "pyramid"
     cant_deg: Annotated[
-        Annotated[float, Meta(gt=0, lt=90, description="an angle between 0 and 90 degrees")],
+        Annotated[float, Meta(gt=0, lt=90, description="an angle between 0 and 90")],
         Meaning("tilt of the spin axes toward +z; the default gives equal torque about all axes", "deg"),
     ] = 35.264389682754654
     axes_key: ClassVar[str] = "cant_deg"

@@ -18,7 +18,7 @@ from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.scenario.custom import CUSTOM_DRAW
 from ptsmc_jax.scenario.values import Four, Kinds, Meaning, NotNegative, NotNegatives, Positive, Table, Three, Truth
 
-Angle = Annotated[float, Meta(ge=0, le=180, description="an angle from 0 to 180 degrees")]
+Angle = Annotated[float, Meta(ge=0, le=180, description="an angle from 0 to 180")]
 SmallFraction = Annotated[float, Meta(ge=0, le=0.3, description="a number from 0 to 0.3")]
 BelowOne = Annotated[float, Meta(ge=0, lt=1, description="a number from 0 to below 1")]
 

@@ -390,19 +390,31 @@ def _parse_value(key: str, value: Any, value_type: Any, unit: str = "") -> Any:
     try:
         return msgspec.convert(number, value_type, strict=True)
     except msgspec.ValidationError:
-        raise wrong(key, value, allowed + _hint(key, number, unit)) from None
+        raise wrong(key, value, allowed + _hint(key, number, unit, allowed)) from None
 
 
-def _hint(key: str, value: Any, unit: str) -> str:
-    """Return a hint if a value that is not allowed has texts without a known unit, or is one noise per axis."""
-    units = [*catalogues.UNITS.get(unit, {})]
-    if units and any(isinstance(one, str) for one in (value if isinstance(value, tuple) else [value])):
-        return f' [{unit}], or with a unit such as "0.05 {units[:2][-1]}", in {", ".join(units)}'
+def _hint(key: str, value: Any, unit: str, allowed: str) -> str:
+    """Return a hint for a value that is not allowed: how its unit, a whole number or a noise per axis is written."""
+    units = catalogues.UNITS.get(unit, {})
+    entries = value if isinstance(value, tuple) else (value,)
+    if units and any(isinstance(one, str | Mapping) for one in entries):
+        return f" [{unit}], or with a unit such as {catalogues.EXAMPLES[unit]}, in {', '.join(units)}"
+    if any(_split_number(one)[1] for one in entries):
+        return ", without a unit"
+    if isinstance(value, float) and value.is_integer() and "whole number" in allowed:
+        return f", written as {value:.0f}"
     if key == "hardware.attitude_noise" and isinstance(value, tuple):
         return " for all axes: the largest one, or noise_across and noise_about of a star_tracker in [[sensors]]"
     if key.removeprefix("hardware.") in device_tables.Hardware.noise_keys and isinstance(value, tuple):
         return " for all axes: the largest one, or a custom sensor in [sensors] if they differ"
-    return ""
+    return f" [{unit}]" if units else ""
+
+
+def _split_number(text: Any) -> tuple[str, str]:
+    """Return the number and the unit of a text such as "0.05 deg"; both are empty for other values."""
+    joined = " ".join(text.split()) if isinstance(text, str) else ""
+    match = re.fullmatch(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?) ?(.*)", joined)
+    return (match[1], match[2]) if match else ("", "")
 
 
 def _to_numbers(value: Any, units: Mapping[str, float]) -> Any:
@@ -410,11 +422,11 @@ def _to_numbers(value: Any, units: Mapping[str, float]) -> Any:
     if hasattr(value, "tolist"):
         value = value.tolist()
     if isinstance(value, str):
-        match = re.fullmatch(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?) ?(.*)", " ".join(value.split()))
-        if match is None or match[2] not in units:
+        number, unit = _split_number(value)
+        if unit not in units:
             return value
         # the nearest double: 20 * 1e-6 in floating point is not 2e-5
-        return float(_DECIMAL.multiply(_DECIMAL.create_decimal(match[1]), Decimal(str(units[match[2]]))))
+        return float(_DECIMAL.multiply(_DECIMAL.create_decimal(number), Decimal(str(units[unit]))))
     return tuple(_to_numbers(one, units) for one in value) if isinstance(value, list | tuple) else value
 
 

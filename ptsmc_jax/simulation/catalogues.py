@@ -56,6 +56,12 @@ UNITS: dict[str, dict[str, float]] = {
     "deg": {"deg": 1.0, "rad": 180 / math.pi},
     "dB": {"dB": 1.0},
 }  # fmt: skip
+# usual numbers in usual units, for error messages
+EXAMPLES = {
+    "rad": '"10 arcsec" or "0.5 deg"', "rad/s": '"0.3 deg/h" or "2 deg/s"', "rad/s/sqrt(Hz)": '"0.02 deg/sqrt(h)"',
+    "rad/s/sqrt(s)": '"0.1 deg/h/sqrt(h)"', "N m": '"5 mN m"', "N m s": '"20 mN m s"', "N m/s": '"1 mN m/s"',
+    "s": '"200 ms" or "2 min"', "m": '"500 km"', "sqrt(kg) m": '"0.8 sqrt(kg) m"', "deg": '"30 deg"', "dB": '"6 dB"',
+}  # fmt: skip
 CATALOGUES = {"spacecraft": CATALOGUE, "chain": STATE_CATALOGUE, "system": STATE_CATALOGUE}  # by the kind of the plant
 ANGLE_UNITS = {"spacecraft": "rad", "chain": "x1", "system": "x1"}  # unit of the column `initial_angle`
 

@@ -1,6 +1,7 @@
 """Limits with units, limits of zero, and the ratio to the limit in a verdict."""
 
 import math
+import re
 
 import jax
 import numpy as np
@@ -44,6 +45,14 @@ def test_a_limit_can_be_text_with_a_unit(metric, said, value):
 
 def test_every_metric_unit_of_a_spacecraft_accepts_text():
     assert {entry.unit for entry in catalogues.CATALOGUE.values()} - {"-"} <= set(catalogues.UNITS)
+
+
+def test_every_unit_has_an_example_for_error_messages():
+    assert catalogues.EXAMPLES.keys() == catalogues.UNITS.keys()
+    for unit, shown in catalogues.EXAMPLES.items():
+        for number, name in re.findall(r'"(\S+) (.*?)"', shown):
+            assert float(number) > 0.0
+            assert name in catalogues.UNITS[unit]
 
 
 @pytest.mark.parametrize(
