@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import tomllib
 from dataclasses import replace
 from typing import Any
@@ -204,11 +205,30 @@ def test_gain_factor_below_one_gives_the_distance_to_the_nearest_stability_limit
     assert linear.spectral_radius(weak, 0.999 / factor) > 1.0 > linear.spectral_radius(weak, 1.001 / factor)
 
 
+@pytest.mark.parametrize(
+    ("inertia", "key", "refused"),
+    [
+        ([10.0, 12.0, 14.0], "spacecraft.inertia", "of which a map changes one; allowed are spacecraft.inertia[0], sp"),
+        ([[10.0, 0, 0], [0, 12.0, 0], [0, 0, 14.0]], "spacecraft.inertia", "such as three principal moments"),
+        ([[10.0, 0, 0], [0, 12.0, 0], [0, 0, 14.0]], "spacecraft.inertia[0]", "such as three principal moments"),
+    ],
+)
+def test_an_inertia_is_not_replaced_by_a_number(inertia, key, refused):
+    loaded = scenario.from_tables({"spacecraft": {"inertia": inertia}})
+    with pytest.raises(ScenarioError, match=re.escape(refused)):
+        mapping.simulate(
+            loaded, mapping.parse_axis(f"{key}=9:11:2", "--x"), mapping.parse_axis("controller.eta=3:4:2", "--y"),
+            0, 1, lambda done, total: None,
+        )  # fmt: skip
+
+
 def test_value_is_set_on_all_axes_and_in_missing_keys():
     loaded, _, _ = asked("hardware.torque_lag=0.01:0.1:2", "controller.delta=1:2:2")
     changed: Any = mapping._with_keys(loaded, {"observer.gain": 7.0, "hardware.torque_lag": 0.2, "hardware.delay": 1.0})
     assert changed.observer.gain == (7.0, 7.0, 7.0)
     assert (changed.hardware.torque_lag, changed.hardware.delay) == (0.2, 1)
+    changed: Any = mapping._with_keys(loaded, {"spacecraft.inertia[1]": 13.0})
+    assert changed.spacecraft.inertia == (10.0, 13.0, 14.0)
 
 
 def test_map_without_a_valid_pair_is_refused():
@@ -323,5 +343,7 @@ def test_spillover_limit_separates_stable_and_unstable_pairs(monkeypatch):
     assert changed.flexible.frequency == (5.0, 9.0)
     with pytest.raises(ScenarioError, match=r"flexible.frequency\[2\] does not exist: flexible.frequency is"):
         mapping._with_keys(loaded, {"flexible.frequency[2]": 5.0})
+    with pytest.raises(ScenarioError, match=r"flexible.coupling has rows of numbers, but a map changes only a number"):
+        mapping._with_keys(loaded, {"flexible.coupling": 5.0})
     rigid, *_ = asked("loop.period=0.1:0.4:3", "controller.delta=0.5:1:3")
     assert mapping.spillover_limit_curves(mapping.Map(rigid, x, y, cells)) == {}

@@ -136,7 +136,7 @@ def map_(
     Exit status: 0 done, 2 configuration error. A pair that is not allowed or fails is marked, not dropped.
 
     Args:
-        x: KEY=LOW:HIGH:COUNT; default: loop.period from 0.4 to 10 times the scenario's period.
+        x: KEY=LOW:HIGH:COUNT, KEY[0] for one number of a list; default: loop.period, 0.4 to 10 times its value.
         y: KEY=LOW:HIGH:COUNT; default: delta from a period to t_f / 7, or the law's first gain.
         trials: Trials of each pair, 1 to 1000000.
     """

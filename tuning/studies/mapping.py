@@ -195,6 +195,9 @@ def _with_keys(scenario: Scenario, values: dict[str, float]) -> Scenario:
 
     If a key has a number for each axis or mode, all of them get the value. A key with an index, such as
     flexible.frequency[0], changes one of them.
+
+    Raises:
+        ScenarioError: the scenario is not valid, the key has rows of numbers, or all moments of inertia would be equal.
     """
     changes: dict[str, Any] = {}
     for key, value in values.items():
@@ -203,6 +206,13 @@ def _with_keys(scenario: Scenario, values: dict[str, float]) -> Scenario:
         current = changes.get(f"{table}__{name}", getattr(getattr(scenario, table, None), name, None))
         new_value: Any = int(value) if key in WHOLE_NUMBERS else value
         if isinstance(current, tuple | list):
+            is_inertia = f"{table}.{name}" in ("spacecraft.inertia", "spacecraft.true_inertia")
+            if any(isinstance(element, tuple | list) for element in current):
+                allowed = "a number or a list of numbers" + ", such as three principal moments" * is_inertia
+                raise ScenarioError(f"{table}.{name} has rows of numbers, but a map changes only {allowed}")
+            if is_inertia and not index:
+                allowed = ", ".join(f"{key}[{k}]" for k in range(len(current)))
+                raise ScenarioError(f"{key} has three moments, of which a map changes one; allowed are {allowed}")
             chosen_index = index.removesuffix("]")
             chosen = {int(chosen_index)} if chosen_index.isdecimal() else set(range(len(current)))
             if not chosen <= set(range(len(current))):
