@@ -154,7 +154,7 @@ def _check_periods(scenario: Scenario) -> None:
     if scenario.end / loop.period > MOST_STEPS:
         raise wrong("loop.period", loop.period, f"at least loop.t_end / {MOST_STEPS}, {scenario.end / MOST_STEPS}")
     if command_filter is not None and command_filter.corner >= math.pi / loop.period:
-        highest = f"below pi / loop.period = {math.pi / loop.period:.6g}, the Nyquist frequency"
+        highest = f"below pi / loop.period = {math.pi / loop.period:.6g} rad/s, the Nyquist frequency"
         raise wrong("hardware.command_filter.corner", command_filter.corner, highest)
     if window < loop.period * (1 - 1e-9):
         raise wrong("loop.window", window, f"at least one control period, loop.period = {loop.period}")

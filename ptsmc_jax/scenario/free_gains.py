@@ -138,7 +138,7 @@ def _check_bounds(context: BoundsContext, name: str) -> None:
         raise ScenarioError(f"{key} bounds a gain that is not free; tune.free is {errors.brief(context.free)}")
     smallest, largest, is_closed = gain_bounds.bounds_of(context.scenario, name).allowed(context)
     if not (smallest <= lower if is_closed else smallest < lower) or not upper < largest:
-        allowed = f"two numbers {'from' if is_closed else 'above'} {smallest}"
+        allowed = f"two numbers {'of at least' if is_closed else 'above'} {smallest}"
         raise wrong(key, [lower, upper], allowed + (f" and below {largest}" if math.isfinite(largest) else ""))
     if lower >= upper:
         raise wrong(key, [lower, upper], "two numbers, the lower bound first and below the upper one")

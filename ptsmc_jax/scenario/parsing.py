@@ -40,6 +40,7 @@ DEEPEST = 8  # nesting of tables and arrays; a rotation matrix of a disturbance 
 LONGEST_KEY = 100  # largest number of characters of a key
 MOST_LISTED = 20  # largest number of known names that an error lists
 TABLES_OF_NAMES = ("telemetry", "dispersion")  # tables whose keys have the names of other things
+SUITE_TEXT = "tables with a kind, [[sensors]] for each sensor"
 _TOO_DEEP = f"but at most {DEEPEST} levels are allowed"
 _DECIMAL = decimal.Context(traps=[])  # an overflow gives infinity, which is refused later
 # a very long dotted key: the memory that the parser needs for it grows with the square of its length
@@ -65,10 +66,23 @@ def read_toml(path: str | Path) -> dict[str, Any]:
         raise ScenarioError(f"{name} does not exist") from None
     except OSError as error:
         raise ScenarioError(f"{name} cannot be read: {error.strerror}") from None
-    except ValueError as error:  # TOMLDecodeError, no UTF-8, or a number with too many digits for Python
-        raise ScenarioError(f"{name} is no valid TOML: {error}") from None
+    except UnicodeDecodeError:
+        raise ScenarioError(f"{name} is not encoded in UTF-8") from None
+    except ValueError as error:  # TOMLDecodeError, or a number with too many digits for Python
+        raise ScenarioError(f"{name} is no valid TOML: {error}{_faulty_line(text, str(error))}") from None
     except RecursionError:
         raise ScenarioError(f"{name} has tables or arrays in each other, {_TOO_DEEP}") from None
+
+
+def _faulty_line(text: str, message: str) -> str:
+    """Return the line that an error message of the TOML parser is about, and a hint if its value lacks quotes."""
+    place = re.search(r"\(at line (\d+)", message)
+    if place is None:
+        return ""
+    line = " ".join(text.split("\n")[int(place[1]) - 1].split())
+    without_quotes = re.search(r"=\s*[-+.\d]*\s*[A-Za-z][\w/]*\s*(#.*)?$", line)
+    hint = "; a text needs quotes, also a number with a unit" if without_quotes else ""
+    return f": {line[:LONGEST_KEY]}{hint}" if line.isprintable() else ""
 
 
 def load(path: str | Path) -> dict[str, Any]:
@@ -104,12 +118,13 @@ def parse(raw: Mapping[str, Any], *, run_code: bool = False) -> Scenario:
             raise _unknown_table_error(name, table, kind)
         is_suite = name == "sensors" and isinstance(table, list | tuple)
         if not isinstance(table, Mapping | None) and not is_suite:
-            raise wrong(name, table, "a table")
+            raise _no_table_error(name, table, layout.get(name))
     present = {name: table for name, table in raw.items() if table is not None}
     plant = present.get("plant", {})
     context = Context(scenario_class, run_code)
     law_kind = _kind_of("controller", present.get("controller", {}), typing.cast(Kinds, layout["controller"]))
-    plant_table = _parse_table("plant", plant, layout["plant"], context)
+    plants = {name: typing.cast(type[Table], tables["plant"]) for name, tables in TABLES.items()}
+    plant_table = _parse_table("plant", plant, plants, context)
     defaults = scenario_class.plant_defaults(plant_table, plant.keys(), law_kind)
     tables: dict[str, Any] = {}
     for name, kinds in layout.items():
@@ -117,6 +132,8 @@ def parse(raw: Mapping[str, Any], *, run_code: bool = False) -> Scenario:
         if isinstance(table, list | tuple):
             tables[name] = _parse_sensor_suite(table, context)
         elif name in present or name not in layouts.OPTIONAL:
+            if name == "sensors" and kind == "spacecraft" and "code" not in table and table.get("kind") != "custom":
+                raise wrong(name, table, f'{SUITE_TEXT}, or [sensors] with kind = "custom"')
             tables[name] = _parse_table(name, table, kinds, context, defaults.get(name))
     # plain limits first, as TOML writes them, so that the order of verdicts is the same for a scenario that was saved
     limits = {key: value for key, value in present.get("requirements", {}).items() if value is not None}
@@ -143,12 +160,20 @@ def _check_shape(name: str, value: Any, levels: int) -> None:
 def _kind_of(name: str, raw: Mapping[str, Any], kinds: Mapping[str, Any]) -> str:
     """Return the kind of a table, by default the first one; raise ScenarioError if there is no such kind."""
     if not isinstance(raw, Mapping):
-        raise wrong(name, raw, "a table")
+        raise _no_table_error(name, raw, kinds)
     kind = next(iter(kinds)) if raw.get("kind") is None else raw["kind"]
     if not isinstance(kind, str) or kind not in kinds:
         known = list(map(show, kinds))
         raise wrong(f"{name}.kind", kind, " or ".join(known) if len(known) < 8 else f"one of {', '.join(known)}")
     return kind
+
+
+def _no_table_error(name: str, value: Any, kinds: Any) -> ScenarioError:
+    """Return the error for a value that must be a table; kinds: its class, or its classes by kind."""
+    example = f" such as {{ kind = {show(next(iter(kinds)))} }}" if isinstance(kinds, Mapping) else ""
+    if name == "disturbance" and isinstance(value, list | tuple):
+        example = ' such as { kind = "sum", terms = [{ kind = "constant" }, { kind = "sinusoid" }] }'
+    return wrong(name, value, f"a table{example}")
 
 
 def _unknown_table_error(name: str, value: Any, kind: str) -> ScenarioError:
@@ -237,18 +262,19 @@ def _without_none(value: Any) -> Any:
 
 
 def nearest_name_hint(name: str, known: Iterable[str], template: str = "{}") -> str:
-    """Return a hint for an unknown name: the one or two most similar known names, or all known names if they are few.
+    """Return a hint for an unknown name: the one or two most similar known names, or the first known names.
 
     Args:
         name: the unknown name.
         known: the known names.
         template: format of a known name in the hint.
     """
-    known = list(known)
-    similar = functools.partial(difflib.get_close_matches, name, known)
+    known = {one.lower(): one for one in known}
+    similar = functools.partial(difflib.get_close_matches, name.lower(), known)
     # a misspelt name has one very similar name; of less similar names the second one may be meant
-    matches = similar(n=1, cutoff=0.85) or similar(n=2, cutoff=0.6 if len(known) <= MOST_LISTED else 0.0)
-    shown = ", ".join(template.format(one) for one in matches or known)
+    matches = similar(n=1, cutoff=0.85) or similar(n=2)
+    listed = [known[one] for one in matches] or list(known.values())[:MOST_LISTED]
+    shown = ", ".join(map(template.format, listed)) + (", .." if len(listed) == MOST_LISTED < len(known) else "")
     return f"the nearest known {'ones are' if matches[1:] else 'one is'} {shown}" if matches else f"known are {shown}"
 
 
@@ -293,8 +319,7 @@ def _parse_sensor_suite(raw: Any, context: Context) -> Table:
     """Return the table of [[sensors]]."""
     if context.scenario_class.motion != "spacecraft":
         raise ScenarioError('[[sensors]] needs plant.kind = "spacecraft"; allowed is [sensors] with kind = "custom"')
-    allowed = "tables with a kind, [[sensors]] for each sensor"
-    return sensor_tables.SensorSuite(each=_parse_list("sensors", raw, sensor_tables.SENSORS, allowed, context))
+    return sensor_tables.SensorSuite(each=_parse_list("sensors", raw, sensor_tables.SENSORS, SUITE_TEXT, context))
 
 
 def _parse_custom_part(name: str, raw: Mapping[str, Any], struct: Any, context: Context) -> Table:
@@ -370,8 +395,10 @@ def _unknown_key_error(name: str, key: str, struct: type[Table], context: Contex
     tables = [table for table in keys.table_names_by_key(layout).get(key, []) if table not in TABLES_OF_NAMES]
     if key in layout:
         hint = f"[{key}] is a table of its own"
-    elif tables and name not in tables and not difflib.get_close_matches(key, known, cutoff=0.85):
+    elif tables and name not in tables and not difflib.get_close_matches(key.lower(), known, cutoff=0.85):
         hint = f"{', '.join(f'{table}.{key}' for table in tables)} {'are' if tables[1:] else 'is'}"
+        if len(known) <= MOST_LISTED // 2:
+            hint += f", and the keys of {name} are {', '.join(known)}"
     else:
         hint = nearest_name_hint(key, known, f"{name}.{{}}")
     return ScenarioError(f"{name}.{key} is not a known key{other_kinds}; {hint}")

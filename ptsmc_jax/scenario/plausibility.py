@@ -49,8 +49,8 @@ def _delay_in_seconds(scenario: Scenario) -> Iterator[str]:
     delay, period = scenario.devices.delay_periods, scenario.loop.period
     if delay * period >= MAX_DELAY_FRACTION * scenario.controller.t_f:
         yield (
-            f"hardware.delay is {delay} control periods of {period:g} s, together {delay * period:g} s; the key is not "
-            "a time in seconds"
+            f"hardware.delay is {delay}, a delay of {delay * period:g} s with loop.period = {period:g} s; the key "
+            "counts control periods, not seconds"
         )
 
 

@@ -25,6 +25,7 @@ Vector = Annotated[
     Meta(description='"nadir", "velocity", "orbit_normal", "sun" or three numbers'),
 ]
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
+Angle = Annotated[float, Meta(ge=-orbits.TURN, le=orbits.TURN, description=orbits.ANGLE["allowed"])]
 LARGEST_LATITUDE = np.pi / 2  # [rad]
 SMALLEST_ANGLE = np.deg2rad(0.1)  # smallest angle between the two directions, and between the two body axes [rad]
 POINTS, MOST_POINTS = 2048, 2**17  # smallest and largest number of anchors along the run
@@ -165,7 +166,7 @@ class FileReference(ReferenceTable, frozen=True):
 class OrbitTable(PartTable, frozen=True):
     """The orbit of references that point to the Earth, and of the gravity gradient."""
 
-    true_anomaly: Annotated[Number, Meaning("angle from perigee to the spacecraft at t = 0", "rad")] = 0.0
+    true_anomaly: Annotated[Angle, Meaning("angle from perigee to the spacecraft at t = 0", "rad")] = 0.0
 
     @property
     def mean_anomaly(self) -> float:
@@ -359,7 +360,7 @@ class GroundTargetTable(DirectionsTable, frozen=True):
     """One body axis points to a ground target on the rotating Earth, another one as near as possible to a direction."""
 
     latitude: Annotated[Number, Meaning("geodetic, WGS-84", "rad")] = 0.0
-    longitude: Annotated[Number, Meaning("east of Greenwich", "rad")] = 0.0
+    longitude: Annotated[Angle, Meaning("east of Greenwich", "rad")] = 0.0
     height: Annotated[Number, Meaning("above the WGS-84 ellipsoid", "m")] = 0.0
     secondary: Annotated[Vector, SECONDARY] = "velocity"
 

@@ -91,6 +91,8 @@ def load_object(qualified_name: str, allowed: str) -> object:
         with _importing_from(_import_folder(place)):
             module = _run_file(Path(place), content) if place.endswith(".py") else importlib.import_module(place)
     except (Exception, SystemExit) as error:
+        if isinstance(error, ModuleNotFoundError) and f"{place}.".startswith(f"{error.name}."):
+            raise ValueError(f"there is no module {place}; allowed is {allowed}") from None
         raise ValueError(f"running {place} fails: {describe_failure(error, place)}") from error
     _executed_paths.add(os.path.realpath(getattr(module, "__file__", None) or place))
     if not hasattr(module, name):

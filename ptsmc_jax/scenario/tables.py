@@ -138,7 +138,7 @@ class Tune(Table, frozen=True):
         ),
     ] = None
     bounds: Annotated[
-        Annotated[dict[str, Interval], Meta(description="a table of two numbers for each gain")],
+        Annotated[dict[str, Interval], Meta(description="a table of two numbers for each gain, in SI units")],
         Meaning(
             "lower and upper bound of each gain; default: from the mission; the search may widen default "
             "bounds, see scenario.toml in the results"

@@ -26,6 +26,9 @@ DAY = 86_400.0  # length of a day [s]
 OBLIQUITY = np.deg2rad(23.4392911)  # angle between ecliptic and equator at J2000 [rad]
 HALLEY_ITERATIONS = 4  # these solve Kepler's equation up to rounding, for eccentricities of at most 0.9
 NEWTON_ITERATIONS = 2  # further iterations; only these are differentiated
+TURN = 2.0 * np.pi  # [rad]
+# declaration of an angle: most numbers of degrees without their unit are refused
+ANGLE: dict[str, Any] = {"at_least": -TURN, "at_most": TURN, "allowed": "an angle from -2 pi to 2 pi", "unit": "rad"}
 
 
 class Place(NamedTuple):
@@ -49,13 +52,16 @@ class Orbit:
 
     mean_anomaly: Leaf  # mean anomaly at t = 0 [rad]
     earth_angle: Leaf = number(
-        None, unit="rad", meaning="Earth rotation angle at t = 0; default: from loop.epoch, or 0 without it"
+        None, **ANGLE, meaning="Earth rotation angle at t = 0; default: from loop.epoch, or 0 without it"
     )
     semi_major_axis: Leaf = number(6_878_137.0, above=0.0, unit="m", meaning="half of the ellipse's longest diameter")
     eccentricity: Leaf = number(0.0, at_least=0.0, at_most=0.9, meaning="0 is a circle")
-    inclination: Leaf = number(1.7, unit="rad", meaning="angle between orbit plane and equator")
-    ascending_node: Leaf = number(0.0, unit="rad", meaning="right ascension of the ascending node")
-    perigee: Leaf = number(0.0, unit="rad", meaning="argument of perigee, from the ascending node")
+    inclination: Leaf = number(
+        1.7, at_least=0.0, at_most=np.pi, allowed="an angle from 0 to pi", unit="rad",
+        meaning="angle between orbit plane and equator",
+    )  # fmt: skip
+    ascending_node: Leaf = number(0.0, **ANGLE, meaning="right ascension of the ascending node")
+    perigee: Leaf = number(0.0, **ANGLE, meaning="argument of perigee, from the ascending node")
     gravitational_parameter: Leaf = number(3.986004418e14, above=0.0, unit="m^3/s^2", meaning="of the Earth")
 
     def rate(self) -> Any:

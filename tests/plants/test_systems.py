@@ -269,7 +269,8 @@ def test_an_invalid_system_is_refused_in_one_sentence():
         ({"kind": "system", "system": ARM + "s"}, "has no such name"),
         ({"kind": "system", "system": ARM.replace(":arm", ":mass")}, "has a function of that name"),
         ({"kind": "system", "system": "numpy:pi"}, "has a float of that name"),
-        ({"kind": "system", "system": "no_such_module:arm"}, "running no_such_module fails: ModuleNotFoundError"),
+        ({"kind": "system", "system": "scipy.no_such_module:arm"}, "there is no module scipy.no_such_module"),
+        ({"kind": "system", "system": "no_such_module:arm"}, "there is no module no_such_module"),
         (
             {"kind": "system", "system": ARM, "x0": [1, 2, 3]},
             "plant.x0 is [1.0, 2.0, 3.0], but must be a list of x_1 followed by x_2",

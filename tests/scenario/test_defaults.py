@@ -412,8 +412,8 @@ def test_a_delay_that_is_probably_in_seconds_causes_a_warning(delay, said):
     """The warning begins at a tenth of t_f = 30 s, 60 periods of 0.05 s."""
     every = plausibility.warnings(scenario.from_tables({"loop": {"mode": "sampled"}, "hardware": {"delay": delay}}))
     found = [one for one in every if "surface_rate" not in one]  # the surface is too fast for this delay
-    known = f"hardware.delay is {delay} control periods of 0.05 s, together {delay * 0.05:g} s"
-    assert found == [f"{known}; the key is not a time in seconds"] * said
+    known = f"hardware.delay is {delay}, a delay of {delay * 0.05:g} s with loop.period = 0.05 s"
+    assert found == [f"{known}; the key counts control periods, not seconds"] * said
 
 
 @pytest.mark.parametrize(("noise", "said"), [(10.0, True), (0.1, True), (1e-2, False), ("10 arcsec", False)])
