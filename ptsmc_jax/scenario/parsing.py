@@ -186,9 +186,13 @@ def _unknown_table_error(name: str, value: Any, kind: str) -> ScenarioError:
         hint = nearest_name_hint(name, (*layout, "requirements"), "[{}]")
         return ScenarioError(f"[{name}] is not a known table; {hint}")
     tables_of_key = keys.table_names_by_key(layout)
-    closest = difflib.get_close_matches(name, tables_of_key, n=1, cutoff=0.0)[0]
-    place = f"{tables_of_key[closest][-1]}.{closest}"
-    return ScenarioError(f"{name} = {brief(value)} is outside of any table; the nearest known key is {place}")
+    closest = difflib.get_close_matches(name.lower(), tables_of_key, n=1)
+    tables = [table for table in tables_of_key[closest[0]] if table not in TABLES_OF_NAMES] if closest else []
+    places = [f"{table}.{closest[0]}" for table in tables]
+    hint = f"the nearest known {'keys are' if places[1:] else 'key is'} {', '.join(places)}"
+    return ScenarioError(
+        f"{name} = {brief(value)} is outside of any table; {hint if places else 'no table has such a key'}"
+    )
 
 
 def dump(scenario: Scenario) -> dict[str, Any]:

@@ -83,11 +83,15 @@ def _implausible_noise(scenario: Scenario) -> Iterator[str]:
             f"hardware.attitude_noise is {noise:g}, but the gyro has no error: the law measures the true rate; "
             "set hardware.rate_noise or rate_noise_density, or rate_noise = 0 to confirm a perfect gyro"
         )
-    if noise >= MAX_ATTITUDE_NOISE:
-        yield (
-            f"hardware.attitude_noise is {noise:g} rad, {np.rad2deg(noise):.3g} deg, which is very large; a number in "
-            f'another unit has the unit in its value: "{noise:g} arcsec"'
-        )
+    noises = {"hardware.attitude_noise": noise}
+    for k, sensor in enumerate(getattr(scenario.sensors, "each", ())):
+        noises[f"sensors[{k}].noise_across"] = getattr(sensor, "noise_across", None) or 0.0
+    for key, noise in noises.items():
+        if noise >= MAX_ATTITUDE_NOISE:
+            yield (
+                f"{key} is {noise:g} rad, {np.rad2deg(noise):.3g} deg, which is very large; a number in another unit "
+                f'has the unit in its value: "{noise:g} arcsec"'
+            )
 
 
 def _implausible_bound(scenario: Scenario, bound: float, rate_bound: float) -> Iterator[str]:

@@ -173,6 +173,14 @@ class OrbitTable(PartTable, frozen=True):
         """Mean anomaly at t = 0 [rad]."""
         return orbits.mean_anomaly(self.true_anomaly, float(self.eccentricity))  # pyright: ignore
 
+    def check(self) -> None:
+        """Raise ScenarioError for an Earth orbit inside the Earth: its size is probably in km, or an altitude."""
+        numbers: Any = self
+        size, radius = numbers.semi_major_axis, orbits.EQUATORIAL_RADIUS
+        if numbers.gravitational_parameter == orbits.EARTH_GRAVITY and size < radius:
+            allowed = f'at least {radius:.0f} m, the radius of the Earth, or with its unit, such as "6878 km"'
+            raise wrong("orbit.semi_major_axis", size, allowed)
+
     def build(self, epoch: str | None) -> Any:
         """Build the orbit with NumPy numbers; epoch: value of `loop.epoch`."""
         numbers = {field.name: getattr(self, field.name) for field in dataclasses.fields(orbits.Orbit)}

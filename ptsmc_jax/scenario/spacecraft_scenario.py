@@ -358,6 +358,8 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         angle = self.loop.settling_angle
         if angle >= math.pi:  # probably in degrees: every attitude would count as settled
             raise wrong("loop.settling_angle", angle, 'less than pi [rad], or with its unit, such as "0.5 deg"')
+        if self.orbit is not None:
+            self.orbit.check()
         self.reference.check(self)
         for place, term in self.terms_by_place.items():
             term.check(place, self)

@@ -22,6 +22,7 @@ from ptsmc_jax.signals.references import Reference, Target, target_of, with_cont
 
 EARTH_RATE = 7.292115e-5  # rotation rate of the Earth, WGS-84 [rad/s]
 EQUATORIAL_RADIUS, FLATTENING = 6_378_137.0, 1.0 / 298.257223563  # WGS-84 ellipsoid [m, -]
+EARTH_GRAVITY = 3.986004418e14  # gravitational parameter of the Earth [m^3/s^2]
 DAY = 86_400.0  # length of a day [s]
 OBLIQUITY = np.deg2rad(23.4392911)  # angle between ecliptic and equator at J2000 [rad]
 HALLEY_ITERATIONS = 4  # these solve Kepler's equation up to rounding, for eccentricities of at most 0.9
@@ -62,7 +63,7 @@ class Orbit:
     )  # fmt: skip
     ascending_node: Leaf = number(0.0, **ANGLE, meaning="right ascension of the ascending node")
     perigee: Leaf = number(0.0, **ANGLE, meaning="argument of perigee, from the ascending node")
-    gravitational_parameter: Leaf = number(3.986004418e14, above=0.0, unit="m^3/s^2", meaning="of the Earth")
+    gravitational_parameter: Leaf = number(EARTH_GRAVITY, above=0.0, unit="m^3/s^2", meaning="of the Earth")
 
     def rate(self) -> Any:
         """Return the mean motion [rad/s]."""

@@ -418,10 +418,14 @@ def test_a_delay_that_is_probably_in_seconds_causes_a_warning(delay, said):
 
 @pytest.mark.parametrize(("noise", "said"), [(10.0, True), (0.1, True), (1e-2, False), ("10 arcsec", False)])
 def test_an_implausible_star_tracker_noise_causes_a_warning(noise, said):
-    tables = {"loop": {"mode": "sampled"}, "hardware": {"attitude_noise": noise, "rate_noise": 0.0}}
-    found = [one for one in plausibility.warnings(scenario.from_tables(tables)) if "another unit" in one]
-    assert len(found) == said
-    assert not said or f'"{noise:g} arcsec"' in found[0]
+    tracker, gyro = {"kind": "star_tracker", "noise_across": noise}, {"kind": "gyro", "rate_noise": 1e-6}
+    devices = {"hardware.attitude_noise": {"hardware": {"attitude_noise": noise, "rate_noise": 0.0}},
+               "sensors[0].noise_across": {"sensors": [tracker, gyro]}}  # fmt: skip
+    for key, tables in devices.items():
+        read = scenario.from_tables({"loop": {"mode": "sampled"}, **tables})
+        found = [one for one in plausibility.warnings(read) if "another unit" in one]
+        assert len(found) == said
+        assert not said or (found[0].startswith(key) and f'"{noise:g} arcsec"' in found[0])
 
 
 SURFACE = {"t_f": 60.0, "surface_rate": 1.0}

@@ -92,6 +92,7 @@ def test_extreme_numbers_never_crash_a_study(key, mode, size):
         "initial = { mrp = [0, 0, 0], rate = [0.5, 0, 0] }",  # |v| peaks at 0.92
         "reference = { kind = 'spin', rate = [0, 0.078, 0] }",  # q_f4 = cos(1.56) = 0.011 at t_end
         "dispersion.attitude = { min_deg = 9, max_deg = 9 }",
+        "orbit = { semi_major_axis = 1.84e6, gravitational_parameter = 4.9e12 }",  # of the Moon
         "orbit = { inclination = '180 deg', perigee = '-360 deg', ascending_node = '360 deg' }",
         "pointing = { window = 6.0, after = 9.0 }",  # the default t_end is 51 s
         "requirements.effort = { limit = 9.0 }",
