@@ -56,7 +56,7 @@ class Context(NamedTuple):
 
 def read_toml(path: str | Path) -> dict[str, Any]:
     """Return the raw tables of a TOML file; raise ScenarioError if it is missing or not valid."""
-    name = f"the scenario file {path}"
+    name, text = f"the scenario file {path}", ""
     try:
         text = Path(path).read_text(encoding="utf-8-sig")  # some editors begin a file with a byte order mark
         if _LONG_DOTTED_KEY.search(text):
@@ -171,7 +171,7 @@ def _kind_of(name: str, raw: Mapping[str, Any], kinds: Mapping[str, Any]) -> str
 def _no_table_error(name: str, value: Any, kinds: Any) -> ScenarioError:
     """Return the error for a value that must be a table; kinds: its class, or its classes by kind."""
     example = f" such as {{ kind = {show(next(iter(kinds)))} }}" if isinstance(kinds, Mapping) else ""
-    if name == "disturbance" and isinstance(value, list | tuple):
+    if name == "disturbance" and isinstance(value, list | tuple) and all(isinstance(one, Mapping) for one in value):
         example = ' such as { kind = "sum", terms = [{ kind = "constant" }, { kind = "sinusoid" }] }'
     return wrong(name, value, f"a table{example}")
 
