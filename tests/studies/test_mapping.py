@@ -122,6 +122,7 @@ def test_axes_have_the_units_of_their_keys():
 @pytest.mark.parametrize(
     "text", ["", "delta=1:2:3", "controller.delta", "controller.delta=1:2", "controller.delta=2:1:3", "a.b=1:2:1",
              "a.b=1:nan:3", "a.b=x:2:3", "a.b=1:2:101", "a.b.c=1:2:3",
+             "a.b[x]=1:2:3", "a.b[-1]=1:2:3", "a.b[0=1:2:3",
              "hardware.delay=0:0.4:2", "hardware.star_tracker_every=0.6:1.4:9", "a.b=1:1.0000001:5"]
 )  # fmt: skip
 def test_invalid_axes_are_refused(text):
@@ -343,6 +344,10 @@ def test_spillover_limit_separates_stable_and_unstable_pairs(monkeypatch):
     assert changed.flexible.frequency == (5.0, 9.0)
     with pytest.raises(ScenarioError, match=r"flexible.frequency\[2\] does not exist: flexible.frequency is"):
         mapping._with_keys(loaded, {"flexible.frequency[2]": 5.0})
+    with pytest.raises(ScenarioError, match=r"controller.eta\[0\] does not exist: controller.eta is 3.0"):
+        mapping._with_keys(loaded, {"controller.eta[0]": 5.0})
+    with pytest.raises(ScenarioError, match=r"hardware.gyro_scale\[0\] does not exist: hardware.gyro_scale is absent"):
+        mapping._with_keys(loaded, {"hardware.gyro_scale[0]": 5.0})
     with pytest.raises(ScenarioError, match=r"flexible.coupling has rows of numbers, but a map changes only a number"):
         mapping._with_keys(loaded, {"flexible.coupling": 5.0})
     rigid, *_ = asked("loop.period=0.1:0.4:3", "controller.delta=0.5:1:3")

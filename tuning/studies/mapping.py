@@ -4,6 +4,7 @@ Each pair of values is simulated. Linear covariance analysis and the poles of th
 linear theory. Read `simulate` first.
 """
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -92,8 +93,9 @@ def parse_axis(text: str, option: str) -> Axis:
     """
     key, _, span = text.partition("=")
     parts = span.split(":")
-    message = f"{option} is {text}, but must be KEY=LOW:HIGH:COUNT, such as controller.delta=0.05:3:9"
-    if len(parts) != 3 or key.count(".") != 1:
+    examples = "controller.delta=0.05:3:9 or observer.gain[0]=5:10:3"
+    message = f"{option} is {text}, but must be KEY=LOW:HIGH:COUNT, such as {examples}"
+    if len(parts) != 3 or not re.fullmatch(r"\w+\.\w+(\[\d+\])?", key):
         raise UsageError(message)
     try:
         low, high, count = float(parts[0]), float(parts[1]), int(parts[2])
@@ -205,19 +207,19 @@ def _with_keys(scenario: Scenario, values: dict[str, float]) -> Scenario:
         name, _, index = name.partition("[")
         current = changes.get(f"{table}__{name}", getattr(getattr(scenario, table, None), name, None))
         new_value: Any = int(value) if key in WHOLE_NUMBERS else value
+        number = index.removesuffix("]")
+        if number and int(number) >= (len(current) if isinstance(current, tuple | list) else 0):
+            shown = "absent" if current is None else errors.brief(current)
+            raise ScenarioError(f"{key} does not exist: {table}.{name} is {shown}")
         if isinstance(current, tuple | list):
             is_inertia = f"{table}.{name}" in ("spacecraft.inertia", "spacecraft.true_inertia")
             if any(isinstance(element, tuple | list) for element in current):
                 allowed = "a number or a list of numbers" + ", such as three principal moments" * is_inertia
                 raise ScenarioError(f"{table}.{name} has rows of numbers, but a map changes only {allowed}")
-            if is_inertia and not index:
+            if is_inertia and not number:
                 allowed = ", ".join(f"{key}[{k}]" for k in range(len(current)))
                 raise ScenarioError(f"{key} has three moments, of which a map changes one; allowed are {allowed}")
-            chosen_index = index.removesuffix("]")
-            chosen = {int(chosen_index)} if chosen_index.isdecimal() else set(range(len(current)))
-            if not chosen <= set(range(len(current))):
-                raise ScenarioError(f"{key} does not exist: {table}.{name} is {errors.brief(current)}")
-            new_value = [value if k in chosen else element for k, element in enumerate(current)]
+            new_value = [value if not number or k == int(number) else element for k, element in enumerate(current)]
         changes[f"{table}__{name}"] = new_value
     if "loop.t_end" not in values and {"controller.t_f", "loop.window"} & set(values):  # keep t_end - t_f
         t_f = values.get("controller.t_f", scenario.controller.t_f)
