@@ -3,7 +3,7 @@
 Read `Disturbance` first, the base of all disturbances and of custom ones. `Sum` adds several of them.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from ptsmc_jax.declare import Scaled, number
 from ptsmc_jax.numerics import attitude, elementary
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
+from ptsmc_jax.plants.base import State
 from ptsmc_jax.plants.rigid_body import AttitudeState
 from ptsmc_jax.signals.orbits import Orbit
 
@@ -22,7 +23,7 @@ from ptsmc_jax.signals.orbits import Orbit
 class Disturbance:
     """Base of the disturbances, and of custom ones: a function of time and of the state of the true plant."""
 
-    def __call__(self, t: Scalar, x: Any) -> Float[Array, " m"]:
+    def __call__(self, t: Scalar, x: State) -> Float[Array, " m"]:
         """Return the disturbance (m,) [N m] at the time t [s] in the state x."""
         raise NotImplementedError
 
@@ -41,7 +42,7 @@ class Disturbance:
         """Return the largest size and rate of each component (m,) [N m, N m/s]; None: they are not known."""
         return None
 
-    def on_body(self, inertia: Float[Array, "3 3"]) -> Any:
+    def on_body(self, inertia: Float[Array, "3 3"]) -> "Disturbance":
         """Return the disturbance of a body with this inertia [kg m^2]."""
         return self
 
@@ -57,7 +58,7 @@ class Constant(Disturbance):
     )  # fmt: skip
     drawn: ClassVar[Mapping[str, str]] = {"amplitude": "amplitude"}
 
-    def __call__(self, t: Scalar, x: Any = None) -> Float[Array, " m"]:
+    def __call__(self, t: Scalar, x: State = None) -> Float[Array, " m"]:
         """Return the disturbance at t [s], (m,) [N m]."""
         return self.amplitude
 
@@ -79,7 +80,7 @@ class Bias(Constant):
     drawn: ClassVar[Mapping[str, str]] = {}
 
 
-def _sin_cos_of_sum(angle: Array, phase: Any) -> tuple[Array, Array]:
+def _sin_cos_of_sum(angle: Array, phase: Leaf) -> tuple[Array, Array]:
     """Return sin and cos of angle + phase by the addition theorems.
 
     If phases differ by trial, all trials of a batch use the same sin and cos of the angle, and the sin and cos of the
@@ -108,7 +109,7 @@ class Sinusoid(Disturbance):
     bias: Leaf = number(Scaled(0.0, each=True), unit="unit of d", each=True, meaning="constant part of each component")
     drawn: ClassVar[Mapping[str, str]] = {"phase": "phase", "amplitude": "amplitude"}
 
-    def __call__(self, t: Scalar, x: Any = None) -> Float[Array, " m"]:
+    def __call__(self, t: Scalar, x: State = None) -> Float[Array, " m"]:
         sine, _ = _sin_cos_of_sum(self.frequency * t, self.phase)
         return self.bias + self.amplitude * sine
 
@@ -152,7 +153,7 @@ class GravityGradient(Disturbance):
         c = attitude.rotate(attitude.multiply(attitude.conjugate(x.q), self.orbit), radial)
         return 3.0 * self.orbit_rate**2 * attitude.cross(c, self.inertia @ c)
 
-    def on_body(self, inertia: Float[Array, "3 3"]) -> Any:
+    def on_body(self, inertia: Float[Array, "3 3"]) -> "Disturbance":
         return replace(self, inertia=inertia)
 
 
@@ -174,7 +175,7 @@ class KeplerGravityGradient(Disturbance):
         strength = 3.0 * self.orbit.rate() ** 2 * (self.orbit.semi_major_axis / position.radius) ** 3
         return strength * attitude.cross(c, self.inertia @ c)
 
-    def on_body(self, inertia: Float[Array, "3 3"]) -> Any:
+    def on_body(self, inertia: Float[Array, "3 3"]) -> "Disturbance":
         return replace(self, inertia=inertia)
 
 
@@ -195,27 +196,27 @@ class Sum(Disturbance):
 
     terms: tuple[Any, ...]
 
-    def __call__(self, t: Scalar, x: Any) -> Float[Array, " m"]:
+    def __call__(self, t: Scalar, x: State) -> Float[Array, " m"]:
         total = self.terms[0](t, x)
         for term in self.terms[1:]:
             total = total + term(t, x)
         return total
 
-    def on_body(self, inertia: Float[Array, "3 3"]) -> Any:
+    def on_body(self, inertia: Float[Array, "3 3"]) -> "Disturbance":
         return Sum(tuple(on_body(term, inertia) for term in self.terms))
 
 
-def terms(disturbance: Any) -> tuple[Any, ...]:
+def terms(disturbance: Callable) -> tuple[Any, ...]:
     """Return the terms of a sum, or the disturbance itself as the only term."""
     return disturbance.terms if isinstance(disturbance, Sum) else (disturbance,)
 
 
-def _field_name(term: Any, quantity: str) -> str | None:
+def _field_name(term: object, quantity: str) -> str | None:
     """Return the name of the field with the phase or amplitude, or None. A plain function has no such field."""
     return getattr(term, "drawn", {}).get(quantity)
 
 
-def values(disturbance: Any, quantity: Literal["phase", "amplitude"]) -> Float[Array, " count"]:
+def values(disturbance: Callable, quantity: Literal["phase", "amplitude"]) -> Float[Array, " count"]:
     """Return all phases [rad] or amplitudes [N m] of a disturbance, (count,), in the order of terms and inputs."""
     fields = ((term, _field_name(term, quantity)) for term in terms(disturbance))
     found = [jnp.ravel(getattr(term, field)) for term, field in fields if field is not None]
@@ -241,13 +242,13 @@ def with_values(disturbance: Any, quantity: Literal["phase", "amplitude"], new_v
     return Sum(tuple(changed)) if isinstance(disturbance, Sum) else changed[0]
 
 
-def bias(disturbance: Any, inputs: int) -> Float[Array, " m"]:
+def bias(disturbance: Callable, inputs: int) -> Float[Array, " m"]:
     """Return the `Bias` of a disturbance, (inputs,) [N m]; zeros if it has none."""
     last = terms(disturbance)[-1]
     return last.amplitude if isinstance(last, Bias) else jnp.zeros(inputs)
 
 
-def with_bias(disturbance: Any, value: Float[Array, " m"]) -> Sum:
+def with_bias(disturbance: Callable, value: Float[Array, " m"]) -> Sum:
     """Return the disturbance with this `Bias` (m,) [N m] instead of its previous one."""
     return Sum((*(term for term in terms(disturbance) if not isinstance(term, Bias)), Bias(value)))
 

@@ -235,6 +235,9 @@ class Sun:
         return xp.stack([xp.cos(ecliptic), np.cos(OBLIQUITY) * sine, np.sin(OBLIQUITY) * sine], axis=-1)
 
 
+Direction = Fixed | OrbitDirection | GroundPoint | Sun
+
+
 def sun_direction(days: float) -> Sun:
     """Return the direction to the Sun for days since J2000 at t = 0."""
     turn = 2.0 * np.pi
@@ -264,7 +267,7 @@ class MissionReference(Reference):
 class NadirReference(MissionReference):
     """One body axis points to the Earth's centre, another one along the horizontal velocity."""
 
-    orbit: Any  # `Orbit`
+    orbit: Orbit
 
     def frame(self, t: Scalar) -> Float[Array, "4"]:
         return self.orbit.quaternion(t)
@@ -275,8 +278,8 @@ class NadirReference(MissionReference):
 class TwoVectorReference(MissionReference):
     """One body axis points exactly in a primary direction, another one as near as possible to a secondary one."""
 
-    primary: Any  # a direction, such as `Fixed`
-    secondary: Any
+    primary: Direction
+    secondary: Direction
     orbit: Any  # `Orbit`, or None if no direction depends on it
     anchors: Leaf  # (n, 4) quaternions of the frame, without jumps of their signs, see `anchor_quaternions`
     anchor_rate: Leaf  # number of anchors per second [1/s]
