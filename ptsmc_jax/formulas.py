@@ -1,14 +1,12 @@
 """Formulas of plants, devices and angles in plain NumPy, which need no import of JAX."""
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 ARCSEC = 180.0 * 3600.0 / np.pi  # arcsec in a radian
 
 
-def check_inertia(inertia: Any) -> np.ndarray:
+def check_inertia(inertia: object) -> np.ndarray:
     """Return the inertia tensor (3, 3) [kg m^2] from three principal moments or a tensor.
 
     Raises:
@@ -58,7 +56,7 @@ def is_flexible_body(tensors: np.ndarray, couplings: np.ndarray) -> np.ndarray:
     return smallest_moments > 1e-9 * np.abs(tensors).max(axis=(1, 2))
 
 
-def rest_inertia(inertia: np.ndarray, coupling: Any) -> np.ndarray:
+def rest_inertia(inertia: np.ndarray, coupling: object) -> np.ndarray:
     """Return J - D'D (3, 3) [kg m^2], the inertia of the rigid rest of a flexible body.
 
     Args:
@@ -79,7 +77,7 @@ def rest_inertia(inertia: np.ndarray, coupling: Any) -> np.ndarray:
     return rest
 
 
-def free_mode_frequencies(inertia: np.ndarray, frequency: Any, coupling: Any) -> np.ndarray:
+def free_mode_frequencies(inertia: np.ndarray, frequency: object, coupling: object) -> np.ndarray:
     """Return the undamped angular frequencies (modes,) [rad/s] of a free flexible body.
 
     They solve det(W^2 - w^2 (1 - D J^-1 D')) = 0.
@@ -96,17 +94,17 @@ def free_mode_frequencies(inertia: np.ndarray, frequency: Any, coupling: Any) ->
     return np.sqrt(np.linalg.eigvalsh(root[:, None] * np.linalg.inv(mass) * root))
 
 
-def surface_roots(a: Any) -> np.ndarray:
+def surface_roots(a: ArrayLike) -> np.ndarray:
     """Return the roots (n-1,) [1/s] of p^(n-1) + a_(n-1) p^(n-2) + .. + a_1: the motion on the surface (39)."""
     return np.roots([1.0, *np.asarray(a, dtype=float)[::-1]])
 
 
-def is_hurwitz(a: Any) -> bool:
+def is_hurwitz(a: ArrayLike) -> bool:
     """Whether the matrix of (39) is Hurwitz: all roots of p^(n-1) + .. + a_1 have a negative real part."""
     return bool(np.all(np.real(surface_roots(a)) < 0.0))
 
 
-def wheel_axes(axes: Any) -> np.ndarray:
+def wheel_axes(axes: ArrayLike) -> np.ndarray:
     """Return spin axes of wheels (n, 3) in body axes, normalised; raise ValueError if they do not span all directions.
 
     `axes` are directions (n, 3) of any length.
