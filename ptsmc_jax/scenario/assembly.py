@@ -152,7 +152,7 @@ def build_setup(scenario: Scenario) -> Parts:
     )
 
 
-def build_disturbance(scenario: Scenario, plant: Plant) -> tuple[Any, Any]:
+def build_disturbance(scenario: Scenario, plant: Plant) -> tuple[disturbances.Disturbance, jnp.ndarray | None]:
     """Return the disturbance of the true plant, a function of time and state, and the rate of its random walk or None.
 
     The rate of the random walk is one sigma per second for each input (m,).

@@ -6,13 +6,16 @@ The functions raise ValueError. Its message continues the name of the file, such
 import functools
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ptsmc_jax.scenario import aem, epochs
 from ptsmc_jax.scenario.epochs import Epoch
 from ptsmc_jax.signals import references
+
+if TYPE_CHECKING:
+    from polars import DataFrame
 
 TIME_NAMES = ("t", "time", "time_s", "seconds", "epoch", "utc", "time_utc", "datetime")
 # names that label the scalar part, with its order
@@ -157,7 +160,7 @@ def _quaternion_columns(names: dict[str, str], order: str | None) -> tuple[tuple
                      "with the scalar q0")  # fmt: skip
 
 
-def _read_numbers(frame: Any, name: str) -> np.ndarray:
+def _read_numbers(frame: "DataFrame", name: str) -> np.ndarray:
     """Return a column as finite numbers (n,)."""
     values = frame[name].cast(float, strict=False).to_numpy()
     if not np.all(np.isfinite(values)):
@@ -168,7 +171,7 @@ def _read_numbers(frame: Any, name: str) -> np.ndarray:
     return values
 
 
-def _read_times(frame: Any, name: str, start_epoch: Epoch | None) -> np.ndarray:
+def _read_times(frame: "DataFrame", name: str, start_epoch: Epoch | None) -> np.ndarray:
     """Return the times (n,) [s], from numbers of seconds or calendar times."""
     cells = frame[name].to_list()
     if not cells or not (hasattr(cells[0], "isoformat") or (isinstance(cells[0], str) and "T" in cells[0])):

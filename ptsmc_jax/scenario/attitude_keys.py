@@ -3,7 +3,7 @@
 A table gives an attitude by one of the keys in `ATTITUDE_KEYS`. Start with `quaternion`.
 """
 
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from msgspec import Meta
@@ -11,6 +11,9 @@ from msgspec import Meta
 from ptsmc_jax.scenario import errors
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.values import Four, Matrix, Meaning, Table, Three
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 
 class Attitude(Table, frozen=True):
@@ -33,7 +36,7 @@ class Attitude(Table, frozen=True):
 ATTITUDE_KEYS = ("quat_xyzw", "quat_wxyz", "rotvec_deg", "mrp", "dcm_body_to_inertial", "euler_deg")
 
 
-def unit_quaternion(key: str, value: Any) -> np.ndarray:
+def unit_quaternion(key: str, value: object) -> np.ndarray:
     """Return a quaternion (4,) divided by its norm; raise ScenarioError if the norm is not 1 within 1e-6.
 
     The order of the components does not change. `key` is the full key for errors, such as "initial.quat_xyzw".
@@ -66,7 +69,7 @@ def quaternion(table: Attitude, name: str) -> np.ndarray:
     return converted
 
 
-def _rotation(table: Attitude, name: str, key: str, array: np.ndarray) -> Any:
+def _rotation(table: Attitude, name: str, key: str, array: np.ndarray) -> "Rotation":
     """Return the `Rotation` of an attitude key that is no quaternion, from its numbers."""
     from scipy.spatial.transform import Rotation  # the import takes 0.15 s, and most scenarios do not need it
 
@@ -102,13 +105,13 @@ def stated_keys(table: Attitude) -> list[str]:
     return [key for key in ATTITUDE_KEYS if getattr(table, key) is not None]
 
 
-def attitude_key(table: Attitude) -> tuple[str, Any]:
+def attitude_key(table: Attitude) -> tuple[str, object]:
     """Return the attitude key that a table uses, and its value."""
     key, *_ = stated_keys(table)
     return key, getattr(table, key)
 
 
-def check_single_attitude(name: str, table: Any) -> None:
+def check_single_attitude(name: str, table: Attitude) -> None:
     """Raise ScenarioError if a table has more than one attitude key; `name`: the table's name."""
     present = stated_keys(table)
     if len(present) > 1:

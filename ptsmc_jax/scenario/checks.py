@@ -219,7 +219,7 @@ def _absent_needs(scenario: Scenario) -> dict[str, str]:
     return absent
 
 
-def _check_disturbance_dispersions(scenario: Scenario, random: Mapping[str, Any]) -> None:
+def _check_disturbance_dispersions(scenario: Scenario, random: Mapping[str, object]) -> None:
     """Raise ScenarioError if no disturbance has the phase or the amplitude that is dispersed.
 
     A custom disturbance declares them in `drawn`. A custom key of that name alone does not suffice.

@@ -10,7 +10,7 @@ import math
 import re
 import typing
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import msgspec
 from msgspec import Meta
@@ -24,6 +24,9 @@ from ptsmc_jax.scenario import schema, systems
 from ptsmc_jax.scenario.errors import ScenarioError, brief, show
 from ptsmc_jax.scenario.values import Kinds, Meaning, Table
 from ptsmc_jax.simulation.gains import is_reserved
+
+if TYPE_CHECKING:
+    from ptsmc_jax.plants.base import Plant
 
 CODE_KEYS = ("system", "truth", "code")  # keys that name code, in any table
 DATA_FILE_KEY = "reference.file"  # key that names a data file
@@ -49,7 +52,7 @@ class Custom:
 
 @functools.cache  # as for `schema.make_table`
 def custom_kind(
-    table: Any, base: type, required_methods: tuple[str, ...], summary: str, has_gains: bool = False
+    table: type[Table], base: type, required_methods: tuple[str, ...], summary: str, has_gains: bool = False
 ) -> Any:
     """Return the table of custom parts.
 
@@ -67,7 +70,7 @@ def custom_kind(
     return msgspec.defstruct("Custom", fields, bases=(Custom, table), frozen=True, kw_only=True, namespace=namespace)
 
 
-def find_code_keys(value: Any) -> Iterator[tuple[dict, str]]:
+def find_code_keys(value: object) -> Iterator[tuple[dict, str]]:
     """Yield each table in the tables of a file that names custom code, and the key that names it."""
     if isinstance(value, dict):
         yield from ((value, key) for key in CODE_KEYS if isinstance(value.get(key), str))
@@ -159,7 +162,7 @@ def load_table(table: Any, name: str, code: object) -> Any:
 
 
 @functools.lru_cache(maxsize=256)
-def _add_class_keys(table: Any, custom_class: Any) -> Any:
+def _add_class_keys(table: Any, custom_class: type) -> Any:
     """Return a table with a key for each field of a custom class; raise ValueError for fields that it cannot have."""
     base = table.base
     if all(getattr(custom_class, method, None) is getattr(base, method, None) for method in table.required_methods):
@@ -218,7 +221,7 @@ def fastest_rate(table: Any, name: str, part: Any) -> float:
     return rate
 
 
-def _declaration(table: Any, custom_class: Any, field: dataclasses.Field) -> Declaration:
+def _declaration(table: Any, custom_class: type, field: dataclasses.Field) -> Declaration:
     """Return the declaration of a field of a custom class. A plain number becomes a key without a unit.
 
     ValueError is raised if the default is not a number, not allowed, or not possible for a gain.
@@ -263,7 +266,7 @@ class SensorTable(schema.PartTable, frozen=True):
 
     prefix: ClassVar[str] = "sensors_"
 
-    def build(self, model: Any, period: float) -> Any:
+    def build(self, model: "Plant", period: float) -> custom_sensors.CustomSensors:
         """Return the sensors for the rollout; `model`: the design model of the plant, `period`: control period [s]."""
         part = self.part(model=model)
         _check_field("sensors", part, "draws", _is_count(part.draws, 0), "a whole number of at least 0")
@@ -273,7 +276,7 @@ class SensorTable(schema.PartTable, frozen=True):
 class DrawTable(schema.PartTable, frozen=True):
     """Custom random quantities."""
 
-    def build(self) -> Any:
+    def build(self) -> Draw:
         """Return the dispersion, an instance of `ptsmc_jax.Draw`."""
         part = self.part()
         _check_field("dispersion.custom", part, "count", _is_count(part.count, 1), "a whole number of at least 1")
@@ -285,7 +288,7 @@ def _is_count(value: object, smallest: int) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and value >= smallest
 
 
-def _check_field(table: str, part: Any, field: str, is_allowed: bool, allowed: str) -> None:
+def _check_field(table: str, part: object, field: str, is_allowed: bool, allowed: str) -> None:
     """Raise ScenarioError if a class has a field that is not allowed; `allowed`: the allowed values in words."""
     if not is_allowed:
         beginning = f"{table}.code is a class whose {field} is {show(getattr(part, field))}"

@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from ptsmc_jax.dispersions.variation import RESULT_COLUMNS, Dispersion
 from ptsmc_jax.laws.base import Law, Sample
@@ -21,7 +22,7 @@ from ptsmc_jax.scenario import systems
 from ptsmc_jax.scenario.custom import Custom
 from ptsmc_jax.scenario.errors import ScenarioError, brief
 from ptsmc_jax.scenario.tables import Scenario
-from ptsmc_jax.signals.disturbances import Sum
+from ptsmc_jax.signals.disturbances import Disturbance, Sum
 from ptsmc_jax.simulation.catalogues import CATALOGUE
 from ptsmc_jax.simulation.rollout import Parts
 
@@ -69,7 +70,7 @@ class _Checker:
         shown = brief(table.code) if isinstance(table.code, str) else table.part_class.__name__
         self._beginning, self._made = f"{name}.code is {shown}, but its", table.part_class
 
-    def __call__(self, method: str, function: Callable, *args: Any) -> Any:
+    def __call__(self, method: str, function: Callable, *args: object) -> Any:
         try:
             function(*args)
             _check_tracing(function, args)
@@ -92,7 +93,7 @@ class _Checker:
         """
         return ScenarioError(f"{self._beginning} {method} returns {returned} at t = 0, but must return {allowed}")
 
-    def check(self, method: str, allowed: str, value: Any, example: Any, *, exact: bool = False) -> None:
+    def check(self, method: str, allowed: str, value: object, example: object, *, exact: bool = False) -> None:
         """Raise ScenarioError if a value has not the structure and shapes of an example.
 
         Args:
@@ -106,7 +107,7 @@ class _Checker:
         if found != expected:
             raise self.error(method, found, f"{allowed}, of the form {expected}")
 
-    def check_finite(self, method: str, value: Any, occasion: str = "") -> None:
+    def check_finite(self, method: str, value: object, occasion: str = "") -> None:
         """Raise ScenarioError if a pytree has numbers that are not finite; `occasion`: end of the sentence."""
         for number in map(np.asarray, jax.tree.leaves(value)):
             if not np.all(np.isfinite(number)):
@@ -123,10 +124,10 @@ def _check_tracing(function: Callable, args: tuple) -> None:
     jax.eval_shape(lambda owner, args: unbound(owner, *args), owner, args)
 
 
-def _describe(value: Any, exact: bool) -> str:
+def _describe(value: object, exact: bool) -> str:
     """Return the structure of a pytree with the type and shape of each array, such as (f64(3,), nothing)."""
 
-    def describe_array(array: Any) -> str:
+    def describe_array(array: ArrayLike) -> str:
         array = np.asarray(array)
         is_real = array.dtype.kind in "iuf" and not exact
         return f"{'real' if is_real else array.dtype.name.replace('float', 'f')}{array.shape}"
@@ -134,7 +135,7 @@ def _describe(value: Any, exact: bool) -> str:
     return str(jax.tree.map(describe_array, value)).replace("'", "").replace("None", "nothing")
 
 
-def _check_disturbance(parts: Parts, signal: Any, call: _Checker) -> None:
+def _check_disturbance(parts: Parts, signal: Disturbance, call: _Checker) -> None:
     d = call("__call__", signal, jnp.zeros_like(parts.t_end), parts.initial)
     call.check("__call__", "a number for each input", d, jnp.zeros(parts.plant.inputs))
     call.check_finite("__call__", d)

@@ -7,7 +7,7 @@ need a row in `WHEELS`.
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import msgspec
 import numpy as np
@@ -16,15 +16,18 @@ from msgspec import Meta
 from ptsmc_jax import formulas
 from ptsmc_jax.devices import command_filter
 from ptsmc_jax.devices.actuators import Actuators as ActuatorsPart
-from ptsmc_jax.devices.actuators import wheels
-from ptsmc_jax.devices.attitude_filter import attitude_filter, filter_between_samples
-from ptsmc_jax.devices.attitude_sensors import INTEGER_TOLERANCE, sample_times
-from ptsmc_jax.devices.sensors import PerfectSensors, Sensors, StateSensor
+from ptsmc_jax.devices.actuators import Wheels, wheels
+from ptsmc_jax.devices.attitude_filter import AttitudeFilter, attitude_filter, filter_between_samples
+from ptsmc_jax.devices.attitude_sensors import INTEGER_TOLERANCE, SampleTimes, sample_times
+from ptsmc_jax.devices.sensors import PerfectSensors, Sensor, Sensors, StateSensor
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.scenario import errors
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.schema import PartTable, make_table
 from ptsmc_jax.scenario.values import Kinds, Meaning, NotNegative, NotNegatives, Positive, Table, Three
+
+if TYPE_CHECKING:
+    from ptsmc_jax.scenario.tables import Scenario
 
 ONE_FOR_EACH = "one for each axis, wheel or input"
 PositiveEach = Annotated[
@@ -80,7 +83,7 @@ class Actuators(Table, frozen=True):
         """Control periods from the measurement to the torque."""
         return self.delay or 0
 
-    def check(self, scenario: Any) -> None:
+    def check(self, scenario: "Scenario") -> None:
         """Raise ScenarioError if keys contradict each other or the scenario."""
         step, limit = self.torque_step, self.torque_limit
         if step is not None and limit is not None and step >= 2.0 * limit and getattr(scenario, "wheels", None) is None:
@@ -94,16 +97,16 @@ class Actuators(Table, frozen=True):
             if value is not None and len(value) != channels:
                 raise wrong(f"hardware.{key}", value, errors.list_of(channels, each, entry))
 
-    def noise_of_error(self, scenario: Any) -> tuple[float, float]:
+    def noise_of_error(self, scenario: "Scenario") -> tuple[float, float]:
         """Return the noise of the error and of its rate [1/s], 1 sigma per axis and raw sample."""
         raise NotImplementedError
 
-    def noise_of_s(self, scenario: Any) -> float:
+    def noise_of_s(self, scenario: "Scenario") -> float:
         """Return the noise of the sliding variable in the hold phase, 1 sigma per axis and raw sample."""
         law = scenario.controller
         return law.law.noise_of_s(law, *self.noise_of_error(scenario))
 
-    def actuators(self, wheels: Any) -> Any:
+    def actuators(self, wheels: Wheels | None) -> ActuatorsPart:
         """Return the actuators; `wheels`: the part of `devices.actuators`, or None."""
         values = (self.torque_limit, self.torque_rate_limit, self.torque_lag, self.torque_step)
         limit, rate_limit, lag, step = (None if v is None else vector(v) for v in values)
@@ -183,7 +186,7 @@ class Hardware(Actuators, frozen=True):
         nearest = ratio if math.isinf(ratio) else round(ratio)  # `checks` refuses an interval longer than the run
         return int(nearest) if abs(ratio - nearest) < INTEGER_TOLERANCE * ratio else None
 
-    def check(self, scenario: Any) -> None:
+    def check(self, scenario: "Scenario") -> None:
         """Raise ScenarioError for two gyro noises, or for a slow star tracker without a filter."""
         super().check(scenario)
         if self.rate_noise is not None and self.rate_noise_density is not None:
@@ -204,7 +207,7 @@ class Hardware(Actuators, frozen=True):
                     f"hardware.{key} needs noise of the sensors: without it the law sees the true state"
                 )
 
-    def actuators(self, wheels: Any) -> Any:
+    def actuators(self, wheels: Wheels | None) -> ActuatorsPart:
         """Return the actuators; `wheels`: the part of `devices.actuators`, or None."""
         actuators = super().actuators(wheels)
         if self.actuator_misalignment_deg is None:
@@ -215,7 +218,7 @@ class Hardware(Actuators, frozen=True):
         axes = np.eye(3) if wheels is None else np.asarray(wheels.axes)
         return dataclasses.replace(actuators, directions=vector(rotations.apply(axes.T).T))
 
-    def noise_of_error(self, scenario: Any) -> tuple[float, float]:
+    def noise_of_error(self, scenario: "Scenario") -> tuple[float, float]:
         """Return the noise of the error [-] and of its rate [1/s]: half of the noise of star tracker and gyro.
 
         The error is half an angle. The additive error has at most this noise, depending on the attitude of the
@@ -223,7 +226,7 @@ class Hardware(Actuators, frozen=True):
         """
         return 0.5 * (self.attitude_noise or 0.0), 0.5 * self.gyro_noise(scenario.loop.period)
 
-    def sensors(self, scenario: Any) -> Any:
+    def sensors(self, scenario: "Scenario") -> Sensor:
         """Return star tracker, gyro and filter."""
         if not scenario.uses_measurements:
             return PerfectSensors()
@@ -240,7 +243,7 @@ class Hardware(Actuators, frozen=True):
             misalignment=None if misalignment is None else vector(np.deg2rad(misalignment)),
         )
 
-    def star_times(self, period: float) -> Any:
+    def star_times(self, period: float) -> SampleTimes | None:
         """Return the sample times of the star tracker, None if its interval is a whole number of control periods."""
         return sample_times(self.interval(period), 0.0, period) if self.periods_per_sample(period) is None else None
 
@@ -255,20 +258,20 @@ class StateHardware(Actuators, frozen=True):
     }
     noise_keys: ClassVar[tuple[str, ...]] = ("state_noise",)
 
-    def check(self, scenario: Any) -> None:
+    def check(self, scenario: "Scenario") -> None:
         """Raise ScenarioError unless the noise has one number for each state."""
         super().check(scenario)
         states = len(scenario.plant.x0)
         if self.state_noise is not None and len(self.state_noise) != states:
             raise wrong("hardware.state_noise", self.state_noise, errors.list_of(states, "state in plant.x0"))
 
-    def noise_of_error(self, scenario: Any) -> tuple[float, float]:
+    def noise_of_error(self, scenario: "Scenario") -> tuple[float, float]:
         """Return the noise of the first state and of its derivative; for a system, of the noisiest components."""
         inputs = scenario.inputs  # a system has its positions first, then its rates
         noises = self.state_noise or (0.0,) * (2 * inputs)
         return max(noises[:inputs]), max(noises[inputs : 2 * inputs])
 
-    def noise_of_s(self, scenario: Any) -> float:
+    def noise_of_s(self, scenario: "Scenario") -> float:
         """Return the weights of the surface times the noises; for a system, of its noisiest component."""
         law, noises = scenario.controller, self.state_noise
         if scenario.order == 2 or noises is None:
@@ -277,7 +280,7 @@ class StateHardware(Actuators, frozen=True):
         surface_weights = [weight * rate ** (len(a) - i) for i, weight in enumerate([*a, 1.0])]
         return math.hypot(*(w * noise for w, noise in zip(surface_weights, noises, strict=False)))
 
-    def sensors(self, scenario: Any) -> Any:
+    def sensors(self, scenario: "Scenario") -> Sensor:
         """Return `sensors.StateSensor`, or `PerfectSensors` without noise."""
         return PerfectSensors() if self.state_noise is None else StateSensor(vector(self.state_noise))
 
@@ -288,14 +291,14 @@ class FilterTable(PartTable, frozen=True):
     on: ClassVar[bool] = True
     prefix: ClassVar[str] = "filter_"
 
-    def immediate_noise_fraction(self, scenario: Any) -> float:
+    def immediate_noise_fraction(self, scenario: "Scenario") -> float:
         """Return the fraction of a star tracker sample's noise that reaches the law at once."""
         return 1.0
 
-    def check(self, scenario: Any) -> None:
+    def check(self, scenario: "Scenario") -> None:
         """Raise ScenarioError if keys contradict each other or the scenario."""
 
-    def build(self, scenario: Any) -> Any:
+    def build(self, scenario: "Scenario") -> AttitudeFilter | None:
         """Return the filter, a part of `devices`, or None if the law uses the raw samples."""
 
 
@@ -317,7 +320,7 @@ class SteadyStateFilter(FilterTable, frozen=True):
     gains: ClassVar[tuple[str, ...]] = ("filter_bandwidth",)
     usual: ClassVar[Mapping[str, str]] = {"bandwidth": "bandwidth"}
 
-    def fill_defaults(self, scenario: Any) -> Any:
+    def fill_defaults(self, scenario: "Scenario") -> Any:
         """Fill an absent bandwidth if both noises are greater than 0: they have equal weight at this bandwidth."""
         table, period = scenario.devices, scenario.loop.period
         noises = table.attitude_noise or 0.0, table.gyro_noise(period)
@@ -326,19 +329,19 @@ class SteadyStateFilter(FilterTable, frozen=True):
         bandwidth = formulas.best_bandwidth(*noises, period, table.interval(period))
         return msgspec.structs.replace(self, bandwidth=bandwidth)
 
-    def immediate_noise_fraction(self, scenario: Any) -> float:
+    def immediate_noise_fraction(self, scenario: "Scenario") -> float:
         """Return the attitude gain of a correction, see `devices.attitude_filter.filter_gains`."""
         bandwidth = self.fill_defaults(scenario).bandwidth
         return -math.expm1(-2.0 * bandwidth * scenario.devices.interval(scenario.loop.period))
 
-    def check(self, scenario: Any) -> None:
+    def check(self, scenario: "Scenario") -> None:
         """Raise ScenarioError if the bandwidth is absent and a noise that determines its default is 0."""
         if self.fill_defaults(scenario).bandwidth is None:
             raise ScenarioError(
                 "filter.bandwidth is absent, but must be given where attitude_noise or rate_noise of [hardware] is 0"
             )
 
-    def build(self, scenario: Any) -> Any:
+    def build(self, scenario: "Scenario") -> AttitudeFilter | None:
         """Return a filter of `devices.attitude_filter`, with its own sample times or at control samples."""
         table, period = scenario.devices, scenario.loop.period
         star, gyro, walk = table.attitude_noise or 0.0, table.gyro_noise(period), table.rate_bias_walk or 0.0
@@ -371,7 +374,7 @@ class WheelLimits(Table, frozen=True):
 
     axes_key: ClassVar[str] = ""  # the key that determines the spin axes
 
-    def spin_axes(self) -> Any:
+    def spin_axes(self) -> np.ndarray:
         """Return the spin axis of each wheel in body axes (wheels, 3)."""
         raise NotImplementedError
 
@@ -388,7 +391,7 @@ class WheelLimits(Table, frozen=True):
         if limit is not None and any(abs(h) > limit for h in self.momentum or ()):
             raise wrong("wheels.momentum", self.momentum, f"within wheels.momentum_limit, {limit}")
 
-    def build(self) -> Any:
+    def build(self) -> Wheels:
         """Return the reaction wheels of this table, a `devices.actuators.Wheels`."""
         return wheels(self.spin_axes(), self.momentum, self.torque_limit, self.momentum_limit)
 
@@ -403,7 +406,7 @@ class PyramidWheels(WheelLimits, frozen=True):
     ] = 35.264389682754654
     axes_key: ClassVar[str] = "cant_deg"
 
-    def spin_axes(self) -> Any:
+    def spin_axes(self) -> np.ndarray:
         """Return the spin axes of four wheels (4, 3), tilted toward +z."""
         return formulas.pyramid(np.deg2rad(self.cant_deg))
 
@@ -422,7 +425,7 @@ class AxesWheels(WheelLimits, frozen=True):
     )
     axes_key: ClassVar[str] = "axes"
 
-    def spin_axes(self) -> Any:
+    def spin_axes(self) -> np.ndarray:
         """Return `axes` as an array (wheels, 3)."""
         return np.asarray(self.axes)
 

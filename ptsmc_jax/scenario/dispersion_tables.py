@@ -5,7 +5,7 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import msgspec
 import numpy as np
@@ -17,6 +17,9 @@ from ptsmc_jax.dispersions.numbers import RandomNumbers, any_attitude, axis_angl
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.scenario.custom import CUSTOM_DRAW
 from ptsmc_jax.scenario.values import Four, Kinds, Meaning, NotNegative, NotNegatives, Positive, Table, Three, Truth
+
+if TYPE_CHECKING:
+    from ptsmc_jax.simulation.assembly import Parts
 
 Angle = Annotated[float, Meta(ge=0, le=180, description="an angle from 0 to 180")]
 SmallFraction = Annotated[float, Meta(ge=0, le=0.3, description="a number from 0 to 0.3")]
@@ -49,7 +52,7 @@ class Numbers(Table, frozen=True):
         """The largest deviation from the nominal value that bounds assume."""
         return self.largest_deviation * float(self.widths()[0])
 
-    def build(self, parts: Any, count: int) -> Any:
+    def build(self, parts: "Parts", count: int) -> RandomNumbers:
         """Return `dispersions.numbers.RandomNumbers`, (count,)."""
         return RandomNumbers(self.distribution, vector(self.widths(count)))
 
@@ -159,7 +162,7 @@ class UniformAttitude(Table, frozen=True):
         """Return pi, the largest angle [rad] to the reference."""
         return np.pi
 
-    def build(self, parts: Any, count: int) -> Any:
+    def build(self, parts: "Parts", count: int) -> RandomNumbers:
         """Return `dispersions.numbers.RandomNumbers`."""
         return any_attitude()
 
@@ -175,7 +178,7 @@ class AxisAngle(Table, frozen=True):
         """Return the largest angle [rad] to the reference; `angle`: nominal angle [rad]."""
         return float(np.deg2rad(self.max_deg))
 
-    def build(self, parts: Any, count: int) -> Any:
+    def build(self, parts: "Parts", count: int) -> RandomNumbers:
         """Return `dispersions.numbers.RandomNumbers`."""
         return axis_angle(np.deg2rad(self.min_deg), np.deg2rad(self.max_deg))
 
@@ -190,7 +193,7 @@ class NormalAttitude(Table, frozen=True):
         """Return the angle to the reference [rad] that one random attitude in 10 000 exceeds; `angle`: nominal."""
         return min(angle + 4.6 * float(np.deg2rad(self.std_deg)), np.pi)
 
-    def build(self, parts: Any, count: int) -> Any:
+    def build(self, parts: "Parts", count: int) -> RandomNumbers:
         """Return `dispersions.numbers.RandomNumbers`, a rotation vector."""
         return RandomNumbers("normal", vector(np.full(3, np.deg2rad(self.std_deg))))
 
@@ -207,7 +210,7 @@ class RelativeInertia(Table, frozen=True):
         """The largest relative deviation of a moment that bounds assume, three sigma."""
         return 3.0 * self.std
 
-    def build(self, parts: Any, count: int) -> Any:
+    def build(self, parts: "Parts", count: int) -> numbers.RelativeInertia:
         """Return `dispersions.numbers.RelativeInertia` about the inertia of the true body."""
         moments, axes = np.linalg.eigh(np.asarray(parts.plant.inertia))
         return numbers.RelativeInertia(*map(vector, (moments, axes, self.std, np.deg2rad(self.axes_deg))))
@@ -247,7 +250,7 @@ class CorrelatedInertia(Table, frozen=True):
         """Return the factor (6, 6) [-]."""
         return np.array([[*row, *(0.0,) * (6 - len(row))] for row in self.factor])
 
-    def build(self, parts: Any, count: int) -> Any:
+    def build(self, parts: "Parts", count: int) -> numbers.CorrelatedInertia:
         """Return `dispersions.numbers.CorrelatedInertia` about the inertia of the true body."""
         return numbers.CorrelatedInertia(
             vector(numbers.pseudo_root(np.asarray(parts.plant.inertia))), vector(self.matrix())
@@ -259,7 +262,7 @@ class UniformPhase(Table, frozen=True):
 
     kind: Literal["uniform"] = "uniform"
 
-    def build(self, parts: Any, count: int) -> Any:
+    def build(self, parts: "Parts", count: int) -> RandomNumbers:
         """Return `dispersions.numbers.RandomNumbers`."""
         return RandomNumbers("interval", vector(np.full(count, 2.0 * np.pi)))
 
@@ -270,7 +273,7 @@ class Interval(Table, frozen=True):
     earliest: Annotated[NotNegative, Meaning("earliest start", "s")] = 0.0
     latest: Annotated[NotNegative | None, Meaning("latest start; default: loop.t_end", "s")] = None
 
-    def numbers(self, parts: Any, low: float, high: float) -> RandomNumbers:
+    def numbers(self, parts: "Parts", low: float, high: float) -> RandomNumbers:
         """Return a uniform random time [s] and a uniform random number.
 
         Args:
@@ -289,7 +292,7 @@ class Outage(Interval, frozen=True):
     duration: Annotated[Positive | None, Meaning("duration; default: 10, scaled to the mission", "s")] = None
     scaled: ClassVar[Mapping[str, Scaled]] = {"duration": Scaled(10.0, time=1)}
 
-    def build(self, parts: Any, count: int) -> Any:
+    def build(self, parts: "Parts", count: int) -> RandomNumbers:
         """Return `dispersions.numbers.RandomNumbers`: the random begin, and the duration."""
         assert self.duration is not None  # `scenario.reading` has filled in the default
         return dataclasses.replace(self.numbers(parts, self.duration, self.duration), common=True)
@@ -301,7 +304,7 @@ class Failure(Interval, frozen=True):
     kind: Literal["uniform"] = "uniform"
     known: Annotated[Truth, Meaning("whether the allocation uses the other wheels after the failure")] = False
 
-    def build(self, parts: Any, count: int) -> Any:
+    def build(self, parts: "Parts", count: int) -> RandomNumbers:
         """Return `dispersions.numbers.RandomNumbers`: the time, and a number on (0, 1) that chooses the wheel."""
         return self.numbers(parts, 0.0, 1.0)
 
@@ -315,7 +318,7 @@ class Jitter(Table, frozen=True):
     ] = 0.1  # fmt: skip
     smallest: Annotated[NotNegative, Meaning("smallest value of the largest timing error")] = 0.0
 
-    def build(self, parts: Any, count: int) -> Any:
+    def build(self, parts: "Parts", count: int) -> RandomNumbers:
         """Return `dispersions.numbers.RandomNumbers`."""
         return interval([self.smallest], [self.largest])
 

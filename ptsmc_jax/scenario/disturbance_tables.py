@@ -10,7 +10,7 @@ disturbance 0.01 sin(0.1 t) of Case I. The bounds of a sum add up.
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +29,10 @@ from ptsmc_jax.scenario.errors import ScenarioError, brief, wrong
 from ptsmc_jax.scenario.schema import PartTable, make_table
 from ptsmc_jax.scenario.values import MOST_STEPS, Meaning, Table
 from ptsmc_jax.signals import disturbances
+
+if TYPE_CHECKING:
+    from ptsmc_jax.scenario.spacecraft_scenario import SpacecraftScenario
+    from ptsmc_jax.scenario.tables import Scenario
 
 CIRCULAR_RATE = 1.1e-3  # mean motion of an orbit of 550 km [rad/s]
 PUBLISHED_RATE = 10.0 / 12.0  # l / J of the published observer [1/s], with a mean moment of inertia of 12 kg m^2
@@ -50,7 +54,7 @@ class DisturbanceTable(PartTable, frozen=True):
 
     sampled_only: ClassVar[bool] = False
 
-    def tables_by_name(self, name: str) -> dict[str, Any]:
+    def tables_by_name(self, name: str) -> dict[str, "DisturbanceTable"]:
         """Return the disturbances of this table by their names in a file; `name`: name of this table."""
         return {name: self}
 
@@ -67,7 +71,7 @@ class DisturbanceTable(PartTable, frozen=True):
         """
         return 0.0 if self.part_class is None else self.part_class.impulse(self, end)
 
-    def bounds(self, scenario: Any) -> Bounds | None:
+    def bounds(self, scenario: "Scenario") -> Bounds | None:
         """Return the largest magnitude and rate of each component, dispersions included.
 
         The result is None if custom code that determines it has not run yet.
@@ -80,10 +84,10 @@ class DisturbanceTable(PartTable, frozen=True):
         largest = np.abs(numbers.amplitude) * (1.0 + largest_deviation(scenario, "disturbance_amplitude"))
         return Bounds(*self.part_class.bounds(msgspec.structs.replace(numbers, amplitude=largest)))
 
-    def check(self, name: str, scenario: Any) -> None:
+    def check(self, name: str, scenario: "Scenario") -> None:
         """Raise ScenarioError if keys contradict each other; `name`: the table's name, for errors."""
 
-    def build(self, inertia: Any, scenario: Any) -> Any:
+    def build(self, inertia: jax.Array | None, scenario: "Scenario") -> disturbances.Disturbance | None:
         """Return the part of `signals.disturbances`, None if nothing acts.
 
         `inertia` is the inertia of the true body (3, 3) [kg m^2], None for a plant without a body. ScenarioError is
@@ -101,7 +105,7 @@ class DisturbanceTable(PartTable, frozen=True):
             )
         return part
 
-    def walk(self, period: float) -> Any:
+    def walk(self, period: float) -> jax.Array | None:
         """Return the rate of the random walk, 1 sigma per second for each input (m,), None if there is none.
 
         `period` is the control period [s].
@@ -113,11 +117,11 @@ class NoDisturbance(DisturbanceTable, frozen=True):
 
     kind: Literal["none"] = "none"
 
-    def bounds(self, scenario: Any) -> Bounds:
+    def bounds(self, scenario: "Scenario") -> Bounds:
         """Return zeros."""
         return Bounds(np.zeros(scenario.inputs), np.zeros(scenario.inputs))
 
-    def build(self, inertia: Any, scenario: Any) -> Any:
+    def build(self, inertia: jax.Array | None, scenario: "Scenario") -> disturbances.Disturbance | None:
         """Return None."""
 
 
@@ -175,7 +179,7 @@ class GravityTable(Attitude, DisturbanceTable, frozen=True):
         body_rate = initial_rate + reference_rate + 2.0 * math.pi / scenario.controller.t_f
         return Bounds(np.full(3, 0.5 * factor), np.full(3, factor * ((1.0 + 1.5 * e) * perigee_rate + body_rate)))
 
-    def build(self, inertia: Any, scenario: Any) -> Any:
+    def build(self, inertia: Any, scenario: Any) -> disturbances.Disturbance:
         """Return the gravity gradient.
 
         Without [orbit], the frame of the circular orbit is the inertial frame if no attitude is given.
@@ -193,7 +197,7 @@ class RandomWalkTable(DisturbanceTable, frozen=True):
 
     sampled_only: ClassVar[bool] = True
 
-    def bounds(self, scenario: Any) -> Bounds:
+    def bounds(self, scenario: "Scenario") -> Bounds:
         """Return three sigma at the end of the run, and a bound on the rate of the walk, which has no exact bound.
 
         It is three sigma of the change of the walk over the time constant J / l of the default observer, divided by
@@ -203,10 +207,10 @@ class RandomWalkTable(DisturbanceTable, frozen=True):
         time_constant = 1.0 / observer_rate(scenario)
         return Bounds(density * np.sqrt(scenario.loop.t_end), density / np.sqrt(time_constant))
 
-    def build(self, inertia: Any, scenario: Any) -> Any:
+    def build(self, inertia: jax.Array | None, scenario: "Scenario") -> disturbances.Disturbance | None:
         """Return None: the rollout adds the steps of the walk."""
 
-    def walk(self, period: float) -> Any:
+    def walk(self, period: float) -> jax.Array | None:
         """Return the density over the square root of the period: white noise that is held over a period."""
         return vector(self.density) / np.sqrt(period)  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -223,7 +227,7 @@ class SumDisturbance(Table, frozen=True):
         Meaning("the disturbances, each an inline table with its kind; required"),
     ] = ()
 
-    def tables_by_name(self, name: str) -> dict[str, Any]:
+    def tables_by_name(self, name: str) -> dict[str, DisturbanceTable]:
         """Return the terms of the sum by their names in a file, such as disturbance.terms[0]."""
         return {f"{name}.terms[{k}]": term for k, term in enumerate(self.terms)}
 
@@ -236,7 +240,7 @@ def without_sums(kinds: Mapping[str, type[Table]]) -> dict[str, type[Table]]:
 def _disturbance_kinds(default_kind: str, body: bool) -> Mapping[str, type[Table]]:
     """Return the disturbances by kind; `body`: whether the plant is a spacecraft."""
     changes = () if body else (("frequency", Scaled(1.0, time=-1, each=True)),)  # as in the paper's Figs. 1 and 2
-    kinds: dict[str, Any] = {
+    kinds: dict[str, type[Table]] = {
         "sinusoid": make_table(DisturbanceTable, disturbances.Sinusoid, "sinusoid", body, changes),
         "none": NoDisturbance,
         "constant": make_table(DisturbanceTable, disturbances.Constant, "constant", body),
@@ -259,7 +263,7 @@ DISTURBANCES = {
 }
 
 
-def largest_disturbance(scenario: Any) -> tuple[float, float] | None:
+def largest_disturbance(scenario: "Scenario") -> tuple[float, float] | None:
     """Return K [N m, or unit of d] and c [the same per second] of a scenario's disturbance.
 
     The result is None if the disturbance, or the reference that determines it, is custom code that has not run yet.
@@ -281,13 +285,13 @@ def largest_disturbance(scenario: Any) -> tuple[float, float] | None:
     return float(np.max(largest)), float(np.max(fastest))
 
 
-def largest_deviation(scenario: Any, key: str) -> float:
+def largest_deviation(scenario: "Scenario", key: str) -> float:
     """Return the largest deviation that bounds assume for a key of [dispersion], 0 if it is absent."""
     table = getattr(scenario.dispersion, key, None)
     return 0.0 if table is None else table.largest
 
 
-def observer_rate(scenario: Any) -> float:
+def observer_rate(scenario: "Scenario") -> float:
     """Return l / J of the published observer [1/s], scaled to the mission and at most 1 / h.
 
     For a plant without a body the published rate is 10 1/s.
@@ -298,7 +302,7 @@ def observer_rate(scenario: Any) -> float:
     return min(rate, 1.0 / scenario.loop.period) if scenario.sampled else rate
 
 
-def observer_gain(scenario: Any) -> float:
+def observer_gain(scenario: "Scenario") -> float:
     """Return the gain l of the published observer [N m s], scaled to the mission.
 
     The published gain is 10 N m s for a mean moment of 12 kg m^2.
@@ -306,7 +310,7 @@ def observer_gain(scenario: Any) -> float:
     return observer_rate(scenario) * scenario.mean_inertia
 
 
-def has_unloaded_reference(scenario: Any) -> bool:
+def has_unloaded_reference(scenario: "Scenario") -> bool:
     """Whether the reference is custom code that has not run yet, so that its rate is unknown."""
     return getattr(getattr(scenario, "reference", None), "is_unloaded", False)
 
@@ -354,7 +358,7 @@ def path_bounds(scenario: Any, signal: Any, fastest: float = 0.0) -> Bounds:
     return Bounds(*largest)
 
 
-def _extreme_disturbances(scenario: Any, signal: Any) -> list[Any]:
+def _extreme_disturbances(scenario: "Scenario", signal: disturbances.Disturbance) -> list[disturbances.Disturbance]:
     """Return a custom disturbance with the smallest and the largest random amplitudes, at `PHASE_COUNT` phases."""
     extremes, largest = [signal], 1.0 + largest_deviation(scenario, "disturbance_amplitude")
     amplitudes, phases = disturbances.values(signal, "amplitude"), disturbances.values(signal, "phase")
@@ -366,7 +370,7 @@ def _extreme_disturbances(scenario: Any, signal: Any) -> list[Any]:
     return [disturbances.with_values(one, "phase", phases + angle) for one in extremes for angle in angles]
 
 
-def _body_states(scenario: Any, t: np.ndarray, remaining: np.ndarray) -> Any:
+def _body_states(scenario: "SpacecraftScenario", t: np.ndarray, remaining: np.ndarray) -> AttitudeState:
     """Return the states of the body on the nominal path at times t (n,) [s].
 
     `remaining` (n,) is the remaining fraction of the initial rotation from the reference.

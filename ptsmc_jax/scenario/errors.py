@@ -6,7 +6,6 @@ A message is one sentence that names the key, its value and the allowed values.
 import json
 import re
 from collections.abc import Mapping
-from typing import Any
 
 LONGEST_VALUE = 160  # characters of a value in an error
 MOST_BITS = 1023  # largest length of a whole number that can become a finite float
@@ -21,7 +20,7 @@ class ScenarioError(ValueError):
         allowed: the allowed values in words; empty if the text does not contain "but must be ..".
     """
 
-    def __init__(self, text: str, *, key: str = "", value: Any = None, allowed: str = ""):
+    def __init__(self, text: str, *, key: str = "", value: object = None, allowed: str = ""):
         super().__init__(text)
         self.key, self.value, self.allowed = key, value, allowed
 
@@ -30,7 +29,7 @@ class ScenarioError(ValueError):
         return [f"ScenarioError: {self}"]
 
 
-def wrong(key: str, value: Any, allowed: str) -> ScenarioError:
+def wrong(key: str, value: object, allowed: str) -> ScenarioError:
     """Return the error for a key whose value is not allowed.
 
     Args:
@@ -41,7 +40,7 @@ def wrong(key: str, value: Any, allowed: str) -> ScenarioError:
     return value_error(key, value, f", but must be {allowed}", allowed)
 
 
-def value_error(key: str, value: Any, reason: str, allowed: str = "") -> ScenarioError:
+def value_error(key: str, value: object, reason: str, allowed: str = "") -> ScenarioError:
     """Return the error for the value of a key.
 
     Args:
@@ -60,7 +59,7 @@ def list_of(count: int, each: str, entry: str = "number") -> str:
     return f"a list of {count} {entry}s, one for each {each}"
 
 
-def brief(value: Any) -> str:
+def brief(value: object) -> str:
     """Return the text of a value for an error message, cut after `LONGEST_VALUE` characters."""
     shown = show(value)
     return shown if len(shown) <= LONGEST_VALUE else f"{shown[:LONGEST_VALUE]} ... ({len(shown)} characters)"
@@ -71,7 +70,7 @@ def show_key(key: str) -> str:
     return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else json.dumps(key, ensure_ascii=False)
 
 
-def show(value: Any) -> str:
+def show(value: object) -> str:
     """Return a value as a scenario file would write it."""
     if isinstance(value, bool):
         return str(value).lower()

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from ptsmc_jax.declare import Declaration
 from ptsmc_jax.scenario import mission, scales
 from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.values import MOST_STEPS
 
 Interval = tuple[float, float]
@@ -30,7 +31,7 @@ def is_log_scaled(low: Any, high: Any) -> Any:
 class BoundsContext(NamedTuple):
     """The inputs of the bounds of a gain: the scenario, the free gains, and the bounds that are already known."""
 
-    scenario: Any
+    scenario: Scenario
     free: tuple[str, ...]
     bounds: Mapping[str, Interval]
 
@@ -85,7 +86,7 @@ class GainBounds(NamedTuple):
     reason_above: str | None = None  # why values above the usual upper bound are useless
 
 
-def bounds_of(scenario: Any, name: str) -> GainBounds:
+def bounds_of(scenario: Scenario, name: str) -> GainBounds:
     """Return the bounds of a scenario's gain; `name`: such as "observer_gain"."""
     table = next(table for table in scenario.tuned_tables.values() if name in table.gains)
     key = name.removeprefix(table.prefix)
@@ -122,7 +123,7 @@ def _declared_bounds(declared: Declaration, gain_name: str) -> GainBounds:
     )
 
 
-def _observer_time(scenario: Any) -> float:
+def _observer_time(scenario: Scenario) -> float:
     """Return the prescribed time of the observer [s], the smallest t_f; 0 if it has none."""
     return getattr(scenario.observer, "t_o", None) or 0.0
 
@@ -220,7 +221,8 @@ def _usual_corner(context: BoundsContext) -> Interval:
 
 def _usual_bandwidth(context: BoundsContext) -> Interval:
     scenario = context.scenario
-    width = scenario.estimator.bandwidth
+    estimator: Any = scenario.estimator
+    width = estimator.bandwidth
     return 0.1 * width, min(10.0 * width, max(2.0 * width, 1.0 / scenario.devices.interval(scenario.loop.period)))
 
 

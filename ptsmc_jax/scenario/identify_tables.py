@@ -1,6 +1,6 @@
 """The tables [telemetry] and [identify] of scenario files: columns of a log, and parameters to estimate from it."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from msgspec import Meta
 
@@ -95,7 +95,7 @@ class Identify(Table, frozen=True):
     ] = 1e-6
 
 
-def check(identify: Any, telemetry: Any) -> None:
+def check(identify: Identify | None, telemetry: object) -> None:
     """Raise ScenarioError if keys of the tables contradict each other."""
     if identify is not None and identify.free is not None and len(set(identify.free)) < len(identify.free):
         raise wrong("identify.free", identify.free, "a list of different names")

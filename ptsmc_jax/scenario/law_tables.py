@@ -6,21 +6,25 @@ The numbers of a law are declared in `laws`, and those of an observer in `observ
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import msgspec
 
 from ptsmc_jax.declare import Scaled
 from ptsmc_jax.laws import baselines, kinematics, prescribed_time, time_base
-from ptsmc_jax.laws.base import AccelerationLaw
+from ptsmc_jax.laws.base import AccelerationLaw, Law
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.observers import base, finite_time, nonlinear
 from ptsmc_jax.observers.prescribed_time import PrescribedTimeObserver
+from ptsmc_jax.plants.base import Plant
 from ptsmc_jax.scenario import disturbance_tables, mission
 from ptsmc_jax.scenario.custom import Custom, custom_kind
 from ptsmc_jax.scenario.errors import show, wrong
 from ptsmc_jax.scenario.schema import PartTable, make_table
 from ptsmc_jax.scenario.values import Meaning, NotNegative, Positive
+
+if TYPE_CHECKING:
+    from ptsmc_jax.scenario.tables import Scenario
 
 PUBLISHED_DELTA_O = Scaled(0.05, time=1)  # delta_o of the prescribed-time observer [s]
 KINEMATICS = {"chain": kinematics.ChainKinematics, "system": kinematics.SecondOrderKinematics}
@@ -66,7 +70,7 @@ class LawTable(PartTable, frozen=True):
         """The class of the law, `AccelerationLaw` for a custom law whose code has not run yet."""
         return self.part_class or AccelerationLaw
 
-    def kinematics(self, motion: str) -> Any:
+    def kinematics(self, motion: str) -> type[kinematics.Kinematics]:
         """Return the class of the error kinematics for plants of this `Scenario.motion`."""
         if motion != "spacecraft":
             return KINEMATICS[motion]
@@ -78,7 +82,7 @@ class LawTable(PartTable, frozen=True):
         extra = self.free_if_sampled if sampled else ()  # implicit sampling has no boundary layer
         return self.free_by_default, tuple(name for name in extra if not (self.implicit and name == "sign_width"))
 
-    def fill_defaults(self, scenario: Any) -> Any:
+    def fill_defaults(self, scenario: "Scenario") -> Self:
         """Fill absent bounds of Assumption 1 from the disturbance, then absent gains.
 
         The gains are designed for the sampled loop. If the loop is continuous or the scenario is a published case, they
@@ -97,7 +101,7 @@ class LawTable(PartTable, frozen=True):
             filled = msgspec.structs.replace(filled, delta=max(delta, scenario.loop.period))
         return filled
 
-    def _fill_absent(self, defaults: Mapping[str, Any]) -> Any:
+    def _fill_absent(self, defaults: Mapping[str, object]) -> Self:
         """Return the table with these values for its absent keys."""
         return msgspec.structs.replace(self, **{k: v for k, v in defaults.items() if getattr(self, k) is None})
 
@@ -105,7 +109,7 @@ class LawTable(PartTable, frozen=True):
         """Return the published gains by key, scaled to the units of a mission."""
         return {key: scales.scaled_value(scaled, self) for key, scaled in self.scaled.items()}
 
-    def gains_of(self, design: mission.Design, scenario: Any) -> Mapping[str, float]:
+    def gains_of(self, design: mission.Design, scenario: "Scenario") -> Mapping[str, float]:
         """Return this law's gains for a design of the sampled loop, by key.
 
         The law receives the published gains, scaled to the bandwidth of the design.
@@ -113,7 +117,7 @@ class LawTable(PartTable, frozen=True):
         published = self.published_in(mission.scales(scenario)._replace(time=1.0 / design.rate_factor))
         return self.law.designed(design, published)
 
-    def check(self, scenario: Any) -> None:
+    def check(self, scenario: "Scenario") -> None:
         """Raise ScenarioError if keys contradict each other or the scenario."""
         if not self.law.prescribed and scenario.order != 2:
             allowed = f"2 with controller.kind = {show(scenario.controller.kind)}, a law of second order"
@@ -124,7 +128,7 @@ class LawTable(PartTable, frozen=True):
         if self.implicit:
             scenario.require_sampled_loop('controller.sampling = "implicit"')
 
-    def build(self, scenario: Any, model: Any) -> Any:
+    def build(self, scenario: "Scenario", model: Plant) -> Law:
         """Return the law for the design model of the plant, see `Scenario.design_model`."""
         law = self.part(kinematics=self.kinematics(scenario.motion)(model), delta=vector(scenario.hand_over))
         return dataclasses.replace(law, implicit=True) if self.implicit else law
@@ -173,7 +177,7 @@ class CustomAttitudeTable(CustomTable, frozen=True):
     error: ErrorKind = "multiplicative"
 
 
-def common_keys(law: LawTable) -> dict[str, Any]:
+def common_keys(law: LawTable) -> dict[str, object]:
     """Return the keys that all laws share, with the values of this law."""
     return {name: getattr(law, name) for name in LawTable.__struct_fields__}
 
@@ -218,12 +222,12 @@ class ObserverTable(PartTable, frozen=True):
 
     prefix: ClassVar[str] = "observer_"
 
-    def check(self, scenario: Any) -> None:
+    def check(self, scenario: "Scenario") -> None:
         """Raise ScenarioError if keys contradict each other or the scenario."""
         if isinstance(self, Custom):
             scenario.require_sampled_loop('observer.kind = "custom"')
 
-    def build(self, scenario: Any, model: Any) -> Any:
+    def build(self, scenario: "Scenario", model: Plant) -> base.Observer:
         """Return the observer for the design model of the plant, see `Scenario.design_model`."""
         law, names = scenario.controller, {field.name for field in dataclasses.fields(self.part_class)}
         law_bounds = {
@@ -238,7 +242,7 @@ class ObserverTable(PartTable, frozen=True):
 class LinearTable(ObserverTable, frozen=True):
     """An observer with the gain of l(w) in (53), or with its constant part."""
 
-    def fill_defaults(self, scenario: Any) -> Any:
+    def fill_defaults(self, scenario: "Scenario") -> Self:
         """Fill an absent gain, equal on all axes: the published one, scaled, or a design for the sampled loop."""
         if self.gain is not None:  # pyright: ignore[reportAttributeAccessIssue]
             return self
@@ -251,7 +255,7 @@ class LinearTable(ObserverTable, frozen=True):
 class PrescribedTimeTable(LinearTable, frozen=True):
     """An observer that has converged by t_o."""
 
-    def complete_for_file(self, scenario: Any) -> Any:
+    def complete_for_file(self, scenario: "Scenario") -> Any:
         """Fill absent times: t_o with t_f / 3, delta_o with the published 0.05 s, scaled, or a control period."""
         table: Any = self
         t_o = scenario.controller.t_f / 3 if table.t_o is None else table.t_o
@@ -260,7 +264,7 @@ class PrescribedTimeTable(LinearTable, frozen=True):
         delta_o = min(shortest, t_o / 4) if table.delta_o is None else table.delta_o
         return msgspec.structs.replace(self, t_o=t_o, delta_o=delta_o)
 
-    def check(self, scenario: Any) -> None:
+    def check(self, scenario: "Scenario") -> None:
         """Raise ScenarioError unless delta_o < t_o <= t_f: the observer must have converged before t_f."""
         table, t_f = self.complete_for_file(scenario), scenario.controller.t_f
         if table.t_o > t_f:
@@ -272,7 +276,7 @@ class PrescribedTimeTable(LinearTable, frozen=True):
 class FiniteTimeTable(ObserverTable, frozen=True):
     """An observer whose gain is a bound on the disturbance's rate."""
 
-    def fill_defaults(self, scenario: Any) -> Any:
+    def fill_defaults(self, scenario: "Scenario") -> Self:
         """Fill an absent gain from the bound on the disturbance's rate."""
         if self.gain is not None:  # pyright: ignore[reportAttributeAccessIssue]
             return self
@@ -280,7 +284,7 @@ class FiniteTimeTable(ObserverTable, frozen=True):
         rate = rate or mission.scales(scenario).scaled_value(Scaled(1e-3, inertia=1, time=-1, order=-1))
         return msgspec.structs.replace(self, gain=(20.0 * rate,) * scenario.inputs)
 
-    def check(self, scenario: Any) -> None:
+    def check(self, scenario: "Scenario") -> None:
         """Raise ScenarioError if the gain is below the bound on the disturbance's rate."""
         gain = self.gain  # pyright: ignore[reportAttributeAccessIssue]
         rate_bound = scenario.controller.disturbance_rate_bound or 0.0  # None before custom code has run

@@ -6,7 +6,7 @@ numbers (`is_published_case`). Start with `scales` and `design`.
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
@@ -14,6 +14,11 @@ import numpy as np
 from ptsmc_jax.declare import Scaled
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.values import Table
+
+if TYPE_CHECKING:
+    from ptsmc_jax.scenario.tables import Scenario
+
+_Table = TypeVar("_Table", bound=Table)
 
 PAPER_INERTIA = (10.0, 12.0, 14.0)  # principal moments of the published spacecraft [kg m^2]
 PAPER_TIMES = (30.0, 40.0)  # range of t_f in the published cases of a spacecraft [s]
@@ -41,7 +46,7 @@ class Scales(NamedTuple):
     order: int = 2  # order n of the plant
     inputs: int = 3  # number of inputs of the plant
 
-    def scaled_value(self, scaled: Scaled, table: Any = None) -> Any:
+    def scaled_value(self, scaled: Scaled, table: Table | None = None) -> Any:
         """Return a published number, or a tuple of numbers, in these units.
 
         Args:
@@ -76,7 +81,7 @@ def is_published_case(scenario: Any) -> bool:
     return tuple(np.ravel(scenario.spacecraft.inertia)) == PAPER_INERTIA and PAPER_TIMES[0] <= t_f <= PAPER_TIMES[1]
 
 
-def scales(scenario: Any) -> Scales:
+def scales(scenario: "Scenario") -> Scales:
     """Return the ratios of inertia and t_f to the published case.
 
     Both are 1 for a published case. The inertia is 1 for a plant without a body.
@@ -89,9 +94,9 @@ def scales(scenario: Any) -> Scales:
     return Scales(mean / PAPER_INERTIA[1], t_f / PAPER_TIMES[0], *plant)
 
 
-def fill_scaled_defaults(table: Any, ratios: Scales) -> Any:
+def fill_scaled_defaults(table: _Table, ratios: Scales) -> _Table:
     """Fill absent keys with published numbers in the mission's units, in this table and in the tables inside it."""
-    changes: dict[str, Any] = {}
+    changes: dict[str, object] = {}
     for key in table.__struct_fields__:
         value = getattr(table, key)
         if value is None and key in table.scaled:
@@ -128,13 +133,13 @@ class Design(NamedTuple):
         return min(1.0 / self.time, 2.0 * self.pole)
 
 
-def design(scenario: Any) -> Design:
+def design(scenario: "Scenario") -> Design:
     """Return the design whose predicted error in the hold phase is the smallest."""
     _, most_accurate, _ = _pole_range(scenario)
     return _design(scenario, most_accurate, _default_eta(scenario), OBSERVER_TO_POLE)
 
 
-def starting_designs(scenario: Any) -> list[Design]:
+def starting_designs(scenario: "Scenario") -> list[Design]:
     """Return starting points of a search: slow to fast hold phases, slow and fast observers, the default first."""
     (slowest, most_accurate, fastest), eta = _pole_range(scenario), _default_eta(scenario)
     stable_pole = MAX_POLE_TIMES_DEAD_TIME / dead_time(scenario)
@@ -145,7 +150,7 @@ def starting_designs(scenario: Any) -> list[Design]:
     return [*designs, _design(scenario, most_accurate, _smallest_eta(scenario), 0.3)]
 
 
-def dead_time(scenario: Any) -> float:
+def dead_time(scenario: "Scenario") -> float:
     """Return the dead time of the loop [s]: delay, half a control period for the hold, lag and command filter."""
     devices, period = scenario.devices, scenario.loop.period
     filtering = devices.command_filter
@@ -156,13 +161,13 @@ def dead_time(scenario: Any) -> float:
     )
 
 
-def fastest_pole(scenario: Any) -> float:
+def fastest_pole(scenario: "Scenario") -> float:
     """Return the largest p [1/s] that dead time, flexible modes, and noise against the torque limit allow."""
     stable = MAX_POLE_TIMES_DEAD_TIME * 2.0 / scenario.order  # n poles at -p put the crossover near n p
     return min(stable / dead_time(scenario), _pole_limit_of_modes(scenario), _pole_limit_of_noise(scenario))
 
 
-def _design(scenario: Any, pole: float, eta: float, observer: float) -> Design:
+def _design(scenario: "Scenario", pole: float, eta: float, observer: float) -> Design:
     """Return the design for a pole rate p [1/s], an eta, and an observer rate relative to p."""
     law, period = scenario.controller, scenario.loop.period
     largest_delta = 0.5 * (law.t_f + period)  # [s]
@@ -178,7 +183,7 @@ def _design(scenario: Any, pole: float, eta: float, observer: float) -> Design:
     return Design(eta, pole, rate * scenario.mean_inertia, width, scenario.reaching, scales(scenario).time)
 
 
-def _pole_range(scenario: Any) -> tuple[float, float, float]:
+def _pole_range(scenario: "Scenario") -> tuple[float, float, float]:
     """Return the slowest, the most accurate and the fastest pole rate p [1/s].
 
     Dead time, flexible modes, and noise against the torque limit bound p from above. The most accurate p minimises the
@@ -203,7 +208,7 @@ def _pole_range(scenario: Any) -> tuple[float, float, float]:
     return slowest, float(rates[int(np.argmin(error))]), fastest
 
 
-def _pole_limit_of_modes(scenario: Any) -> float:
+def _pole_limit_of_modes(scenario: "Scenario") -> float:
     """Return the largest p [1/s] that keeps the resonance of every late mode 6 dB below 1.
 
     The loop gain at the resonance w of a mode is 2 p / w times k / (2 z). Here z is its damping, f its fraction of the
@@ -216,7 +221,7 @@ def _pole_limit_of_modes(scenario: Any) -> float:
     return largest_pole
 
 
-def _pole_limit_of_noise(scenario: Any) -> float:
+def _pole_limit_of_noise(scenario: "Scenario") -> float:
     """Return the largest p [1/s] at which noise uses at most `NOISE_FRACTION` of the torque limit.
 
     A noise sample (x, v) commands the acceleration (2 p + l / J) v + p^2 x of the error.
@@ -231,17 +236,17 @@ def _pole_limit_of_noise(scenario: Any) -> float:
     return math.sqrt(2.0 * allowed**2 / (velocity_square + root))
 
 
-def _disturbance_bounds(scenario: Any) -> tuple[float, float]:
+def _disturbance_bounds(scenario: "Scenario") -> tuple[float, ...]:
     """Return the bounds on the disturbing acceleration of the error and on its rate, zeros if they are unknown."""
     law = scenario.controller
     return tuple((value or 0.0) * scenario.influence for value in (law.disturbance_bound, law.disturbance_rate_bound))
 
 
-def _smallest_eta(scenario: Any) -> float:
+def _smallest_eta(scenario: "Scenario") -> float:
     return scenario.least_eta + (SMALLEST_USEFUL_ETA - 2.0)
 
 
-def _default_eta(scenario: Any) -> float:
+def _default_eta(scenario: "Scenario") -> float:
     """Return the published eta, or a smaller one if the first torque would exceed the limit."""
     published_eta, limit, angle = scenario.least_eta + 1.0, scenario.largest_acceleration(), scenario.start_tangent()
     if limit is None or angle == 0.0:

@@ -142,7 +142,7 @@ def parse(raw: Mapping[str, Any], *, run_code: bool = False) -> Scenario:
     return scenario_class(**tables)
 
 
-def _check_shape(name: str, value: Any, levels: int) -> None:
+def _check_shape(name: str, value: object, levels: int) -> None:
     """Raise ScenarioError for too deep nesting and for keys that cannot be printed, before other code visits them."""
     if isinstance(value, Mapping):
         for key in value:
@@ -157,7 +157,7 @@ def _check_shape(name: str, value: Any, levels: int) -> None:
         _check_shape(table, inner, levels - 1)
 
 
-def _kind_of(name: str, raw: Mapping[str, Any], kinds: Mapping[str, Any]) -> str:
+def _kind_of(name: str, raw: Mapping[str, Any], kinds: Mapping[str, object]) -> str:
     """Return the kind of a table, by default the first one; raise ScenarioError if there is no such kind."""
     if not isinstance(raw, Mapping):
         raise _no_table_error(name, raw, kinds)
@@ -168,7 +168,7 @@ def _kind_of(name: str, raw: Mapping[str, Any], kinds: Mapping[str, Any]) -> str
     return kind
 
 
-def _no_table_error(name: str, value: Any, kinds: Any) -> ScenarioError:
+def _no_table_error(name: str, value: object, kinds: object) -> ScenarioError:
     """Return the error for a value that must be a table; kinds: its class, or its classes by kind."""
     example = f" such as {{ kind = {show(next(iter(kinds)))} }}" if isinstance(kinds, Mapping) else ""
     if name == "disturbance" and isinstance(value, list | tuple) and all(isinstance(one, Mapping) for one in value):
@@ -176,7 +176,7 @@ def _no_table_error(name: str, value: Any, kinds: Any) -> ScenarioError:
     return wrong(name, value, f"a table{example}")
 
 
-def _unknown_table_error(name: str, value: Any, kind: str) -> ScenarioError:
+def _unknown_table_error(name: str, value: object, kind: str) -> ScenarioError:
     """Return the error for an unknown table, or for a key outside a table; kind: kind of the plant."""
     layout = TABLES[kind]
     other_plants = [other for other, other_layout in TABLES.items() if name in other_layout]
@@ -214,7 +214,7 @@ def _reduce(scenario: Scenario) -> tuple:
     return _restore, (to_raw_tables(scenario), not custom.has_unloaded_code(scenario), scenario.defaulted)
 
 
-def _restore(raw: Mapping[str, Any], run_code: bool, defaulted: dict[tuple[str, ...], Any]) -> Scenario:
+def _restore(raw: Mapping[str, Any], run_code: bool, defaulted: dict[tuple[str, ...], object]) -> Scenario:
     return msgspec.structs.replace(parse(raw, run_code=run_code), defaulted=defaulted)
 
 
@@ -234,9 +234,9 @@ def stated_tables(scenario: Scenario) -> dict[str, Any]:
     return tables
 
 
-def unstated_values(raw: Mapping[str, Any], tables: Mapping[str, Any]) -> dict[tuple[str, ...], Any]:
+def unstated_values(raw: Mapping[str, object], tables: Mapping[str, object]) -> dict[tuple[str, ...], object]:
     """Return the values of keys in `tables` that `raw` does not have, by the path of the key."""
-    missing: dict[tuple[str, ...], Any] = {}
+    missing: dict[tuple[str, ...], object] = {}
     for key, value in tables.items():
         if isinstance(value, Mapping):
             raw_inner = raw.get(key, {})
@@ -252,7 +252,7 @@ def to_dict(table: Table) -> dict[str, Any]:
     return typing.cast(dict, _without_none(table))
 
 
-def _without_none(value: Any) -> Any:
+def _without_none(value: object) -> object:
     """Convert structs to mappings and tuples to lists. Python objects such as systems and classes stay unchanged."""
     if isinstance(value, msgspec.Struct):
         value = {key: getattr(value, key) for key in value.__struct_fields__}
@@ -283,7 +283,7 @@ def nearest_name_hint(name: str, known: Iterable[str], template: str = "{}") -> 
 
 
 def _parse_table(
-    name: str, raw: Any, kinds: type[Table] | Kinds, context: Context, defaults: Mapping[str, Any] | None = None
+    name: str, raw: Any, kinds: type[Table] | Kinds, context: Context, defaults: Mapping[str, object] | None = None
 ) -> Table:
     """Return a table.
 
@@ -312,21 +312,21 @@ def _parse_table(
     return disturbance_tables.SumDisturbance(terms=terms)
 
 
-def _parse_list(name: str, raw: Any, kinds: Kinds, allowed: str, context: Context) -> tuple[Any, ...]:
+def _parse_list(name: str, raw: object, kinds: Kinds, allowed: str, context: Context) -> tuple[Table, ...]:
     """Return a list of tables with a kind; `allowed`: description of it."""
     if not isinstance(raw, list | tuple) or not raw or not all(isinstance(one, Mapping) for one in raw):
         raise wrong(name, raw, allowed)
     return tuple(_parse_table(f"{name}[{k}]", one, kinds, context) for k, one in enumerate(raw))
 
 
-def _parse_sensor_suite(raw: Any, context: Context) -> Table:
+def _parse_sensor_suite(raw: object, context: Context) -> Table:
     """Return the table of [[sensors]]."""
     if context.scenario_class.motion != "spacecraft":
         raise ScenarioError('[[sensors]] needs plant.kind = "spacecraft"; allowed is [sensors] with kind = "custom"')
     return sensor_tables.SensorSuite(each=_parse_list("sensors", raw, sensor_tables.SENSORS, SUITE_TEXT, context))
 
 
-def _parse_custom_part(name: str, raw: Mapping[str, Any], struct: Any, context: Context) -> Table:
+def _parse_custom_part(name: str, raw: Mapping[str, object], struct: type[Table], context: Context) -> Table:
     """Return the table of a custom part.
 
     It has the keys of its class only if the class is given as an object or if its file may be executed.
@@ -348,7 +348,7 @@ def _parse_custom_part(name: str, raw: Mapping[str, Any], struct: Any, context: 
     return msgspec.structs.replace(_parse_fields(name, shared_keys, struct, context), rest=rest)
 
 
-def _parse_requirement(metric: str, value: Any, context: Context) -> float | Limit:
+def _parse_requirement(metric: str, value: object, context: Context) -> float | Limit:
     key, metrics = f"requirements.{metric}", context.scenario_class.metrics
     if metric not in metrics and metric not in catalogues.MARGINS:
         raise ScenarioError(
@@ -367,7 +367,7 @@ def _parse_requirement(metric: str, value: Any, context: Context) -> float | Lim
 
 
 def _parse_fields(
-    name: str, raw: Mapping[str, Any], struct: type[Table], context: Context, kinds: Kinds | None = None
+    name: str, raw: Mapping[str, object], struct: type[Table], context: Context, kinds: Kinds | None = None
 ) -> Table:
     known_keys = {key.name: key for key in keys.list_keys(struct, context.scenario_class.unit_of_d)}
     values = {}
@@ -408,7 +408,7 @@ def _unknown_key_error(name: str, key: str, struct: type[Table], context: Contex
     return ScenarioError(f"{name}.{key} is not a known key{other_kinds}; {hint}")
 
 
-def _parse_value(key: str, value: Any, value_type: Any, unit: str = "") -> Any:
+def _parse_value(key: str, value: object, value_type: Any, unit: str = "") -> Any:
     """Return the value of a key. Texts with a unit, such as "0.05 deg", become numbers in the unit of the key."""
     try:
         number = _to_numbers(value, catalogues.UNITS.get(unit, {}))
@@ -424,7 +424,7 @@ def _parse_value(key: str, value: Any, value_type: Any, unit: str = "") -> Any:
         raise wrong(key, value, allowed + _hint(key, number, unit, allowed)) from None
 
 
-def _hint(key: str, value: Any, unit: str, allowed: str) -> str:
+def _hint(key: str, value: object, unit: str, allowed: str) -> str:
     """Return a hint for a value that is not allowed: how its unit, a whole number or a noise per axis is written."""
     units = catalogues.UNITS.get(unit, {})
     entries = value if isinstance(value, tuple) else (value,)
@@ -461,7 +461,7 @@ def _to_numbers(value: Any, units: Mapping[str, float]) -> Any:
     return tuple(_to_numbers(one, units) for one in value) if isinstance(value, list | tuple) else value
 
 
-def _find_non_finite(value: Any) -> float | int | None:
+def _find_non_finite(value: object) -> float | int | None:
     if isinstance(value, float) and not math.isfinite(value):
         return value
     if isinstance(value, int) and value.bit_length() > MOST_BITS:

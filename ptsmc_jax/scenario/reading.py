@@ -99,7 +99,7 @@ def freeze_defaults(scenario: Scenario) -> Scenario:
     return msgspec.structs.replace(scenario, defaulted={})
 
 
-def replace(scenario: Scenario | str | Path, **changes: Any) -> Scenario:
+def replace(scenario: Scenario | str | Path, **changes: object) -> Scenario:
     """Return a validated scenario with other values, such as replace(scenario, controller__eta=4.0).
 
     Keys that the scenario does not state keep their defaults, which may change with the new values. A new kind of a
@@ -171,7 +171,7 @@ def in_scenario(scenario: Scenario, gains: Mapping[str, Any]) -> Scenario:
     axis_gains = gain_of_each_axis(gains, axes)
     gains = {base(name): value for name, value in gains.items()}
     gains |= {} if axis_gains is None else {"observer_gain": axis_gains}
-    changes: dict[str, Any] = {}
+    changes: dict[str, object] = {}
     for place, table in scenario.tuned_tables.items():
         values = {name.removeprefix(table.prefix): value for name, value in gains.items() if name in table.gains}
         outer, _, inner = place.partition(".")

@@ -5,7 +5,7 @@ The numbers of a reference are declared in `signals`. Start with `ReferenceTable
 
 import dataclasses
 import functools
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -19,6 +19,9 @@ from ptsmc_jax.scenario.errors import ScenarioError, show, value_error, wrong
 from ptsmc_jax.scenario.schema import PartTable, make_table
 from ptsmc_jax.scenario.values import Four, Kinds, Meaning, Number, Three
 from ptsmc_jax.signals import orbits, references
+
+if TYPE_CHECKING:
+    from ptsmc_jax.scenario.spacecraft_scenario import SpacecraftScenario
 
 Vector = Annotated[
     Literal["nadir", "velocity", "orbit_normal", "sun"] | tuple[float, float, float],
@@ -41,21 +44,21 @@ class Initial(Attitude, frozen=True):
 class ReferenceTable(PartTable, frozen=True):
     """A reference attitude of a spacecraft."""
 
-    def frequencies(self, scenario: Any) -> dict[str, float]:
+    def frequencies(self, scenario: "SpacecraftScenario") -> dict[str, float]:
         """Return the angular frequency of the reference [rad/s], by the key that determines it."""
         raise NotImplementedError
 
-    def check(self, scenario: Any) -> None:
+    def check(self, scenario: "SpacecraftScenario") -> None:
         """Raise ScenarioError if keys are not valid, or contradict other tables."""
 
-    def check_reference_until(self, scenario: Any, last: float, key: str) -> None:
+    def check_reference_until(self, scenario: "SpacecraftScenario", last: float, key: str) -> None:
         """Raise ScenarioError if the reference ends before a run until `last` [s]; key: determines that time."""
 
-    def build(self, scenario: Any) -> Any:
+    def build(self, scenario: "SpacecraftScenario") -> references.Reference:
         """Return the part of `signals`."""
         raise NotImplementedError
 
-    def initial_reference_attitude(self, scenario: Any) -> np.ndarray:
+    def initial_reference_attitude(self, scenario: "SpacecraftScenario") -> np.ndarray:
         """Return the unit quaternion (4,) of the reference at t = 0."""
         raise NotImplementedError
 
@@ -63,17 +66,17 @@ class ReferenceTable(PartTable, frozen=True):
 class AttitudeReference(Attitude, ReferenceTable, frozen=True):
     """An attitude that a spacecraft is to follow."""
 
-    def frequencies(self, scenario: Any) -> dict[str, float]:
+    def frequencies(self, scenario: "SpacecraftScenario") -> dict[str, float]:
         part = self.build(scenario) if isinstance(self, Custom) else self
         return {f"reference.{self.part_class.paced_by}": fastest_rate(self, "reference", part)}
 
-    def check(self, scenario: Any) -> None:
+    def check(self, scenario: "SpacecraftScenario") -> None:
         self.initial_reference_attitude(scenario)
 
-    def build(self, scenario: Any) -> Any:
+    def build(self, scenario: "SpacecraftScenario") -> references.Reference:
         return self.part(q=vector(self.initial_reference_attitude(scenario)))
 
-    def initial_reference_attitude(self, scenario: Any) -> np.ndarray:
+    def initial_reference_attitude(self, scenario: "SpacecraftScenario") -> np.ndarray:
         return attitude_keys.quaternion(self, "reference")
 
 
@@ -99,7 +102,7 @@ class SlewTable(AttitudeReference, frozen=True):
         angle = np.linalg.norm(short)
         return short * (1.0 - 2.0 * np.pi / angle) if self.way == "long" and angle > 0.0 else short
 
-    def check(self, scenario: Any) -> None:
+    def check(self, scenario: "SpacecraftScenario") -> None:
         super().check(scenario)
         attitude_keys.unit_quaternion("reference.to_quat_xyzw", self.to_quat_xyzw)
 
@@ -124,7 +127,7 @@ class FileReference(ReferenceTable, frozen=True):
         Meaning("refuse a file that states another interpolation than a spline, or use the spline in spite of it"),
     ] = "file"
 
-    def _samples(self, scenario: Any) -> attitude_files.Samples:
+    def _samples(self, scenario: "SpacecraftScenario") -> attitude_files.Samples:
         if self.file is None:
             raise ScenarioError("reference.file is absent, but must be given: a CSV, Parquet or AEM file")
         try:
@@ -133,10 +136,10 @@ class FileReference(ReferenceTable, frozen=True):
         except ValueError as error:
             raise value_error("reference.file", self.file, f", {error}") from None
 
-    def frequencies(self, scenario: Any) -> dict[str, float]:
+    def frequencies(self, scenario: "SpacecraftScenario") -> dict[str, float]:
         return {"reference.file": self._samples(scenario).fastest}
 
-    def check(self, scenario: Any) -> None:
+    def check(self, scenario: "SpacecraftScenario") -> None:
         samples = self._samples(scenario)
         first, last = samples.times[0], samples.usable_until
         if first > 0.0 or last < 0.0:
@@ -145,18 +148,18 @@ class FileReference(ReferenceTable, frozen=True):
                               f"after {zero}, which must be in between")  # fmt: skip
         self.check_reference_until(scenario, scenario.end, "loop.t_end")
 
-    def check_reference_until(self, scenario: Any, last: float, key: str) -> None:
+    def check_reference_until(self, scenario: "SpacecraftScenario", last: float, key: str) -> None:
         end = self._samples(scenario).usable_until
         if last > end * (1.0 + 1e-9):
             value = scenario.loop.t_end if key == "loop.t_end" else scenario.search.bounds.get("t_f")
             raise value_error(key, value, f", which needs the attitude until {last:.12g} s, but {self.file} ends at "
                           f"{end:.12g} s")  # fmt: skip
 
-    def build(self, scenario: Any) -> Any:
+    def build(self, scenario: "SpacecraftScenario") -> references.Reference:
         samples = self._samples(scenario)
         return references.interpolate_attitude(samples.times, samples.quaternions, samples.end_rates)
 
-    def initial_reference_attitude(self, scenario: Any) -> np.ndarray:
+    def initial_reference_attitude(self, scenario: "SpacecraftScenario") -> np.ndarray:
         self.check(scenario)
         samples = self._samples(scenario)
         k = int(np.argmin(np.abs(samples.times)))  # the nearest sample is accurate enough for a default
@@ -181,7 +184,7 @@ class OrbitTable(PartTable, frozen=True):
             allowed = f'at least {radius:.0f} m, the radius of the Earth, or with its unit, such as "6878 km"'
             raise wrong("orbit.semi_major_axis", size, allowed)
 
-    def build(self, epoch: str | None) -> Any:
+    def build(self, epoch: str | None) -> orbits.Orbit:
         """Build the orbit with NumPy numbers; epoch: value of `loop.epoch`."""
         numbers = {field.name: getattr(self, field.name) for field in dataclasses.fields(orbits.Orbit)}
         if numbers["earth_angle"] is None:
@@ -195,22 +198,22 @@ ORBITS: Kinds = {"kepler": make_table(OrbitTable, orbits.Orbit, "kepler")}
 class Mission(NamedTuple):
     """The keys of a scenario that directions depend on."""
 
-    orbit: Any  # `OrbitTable`, or None
+    orbit: OrbitTable | None
     epoch: str | None  # `loop.epoch`
     end: float  # end of the run [s]
 
     @classmethod
-    def of(cls, scenario: Any) -> "Mission":
+    def of(cls, scenario: "SpacecraftScenario") -> "Mission":
         """Return the mission of a scenario."""
         return cls(scenario.orbit, scenario.loop.epoch, scenario.end)
 
-    def build_orbit(self, user: str) -> Any:
+    def build_orbit(self, user: str) -> orbits.Orbit:
         """Return the orbit; raise ScenarioError without [orbit]. `user` is the key that needs it, for the error."""
         if self.orbit is None:
             raise ScenarioError(f"{user}, which needs an orbit, but there is no [orbit] table")
         return self.orbit.build(self.epoch)
 
-    def direction(self, key: str, value: Any) -> Any:
+    def direction(self, key: str, value: str | tuple[float, ...]) -> orbits.Direction:
         """Return the direction of a key: a name, or a vector (3,); raise ScenarioError if another table is missing."""
         if not isinstance(value, str):
             _check_axis(key, value)
@@ -245,19 +248,19 @@ class MissionTable(ReferenceTable, frozen=True):
         """Quaternion (4,) from body axes to the axes of the frame."""
         return orbits.mounting(self.primary_axis, self.secondary_axis)
 
-    def check(self, scenario: Any) -> None:
+    def check(self, scenario: "SpacecraftScenario") -> None:
         _check_axis("reference.primary_axis", self.primary_axis)
         _check_axis("reference.secondary_axis", self.secondary_axis, self.primary_axis)
         self.initial_frame(scenario)
 
-    def initial_frame(self, scenario: Any) -> np.ndarray:
+    def initial_frame(self, scenario: "SpacecraftScenario") -> np.ndarray:
         """Return the rotation matrix (3, 3) at t = 0 from the axes of the frame to inertial axes.
 
         It raises ScenarioError if the scenario does not determine the directions.
         """
         raise NotImplementedError
 
-    def initial_reference_attitude(self, scenario: Any) -> np.ndarray:
+    def initial_reference_attitude(self, scenario: "SpacecraftScenario") -> np.ndarray:
         from scipy.spatial.transform import Rotation
 
         self.check(scenario)
@@ -267,21 +270,21 @@ class MissionTable(ReferenceTable, frozen=True):
 class NadirTable(MissionTable, frozen=True):
     """Local vertical, local horizontal."""
 
-    def _orbit(self, scenario: Any) -> Any:
+    def _orbit(self, scenario: "SpacecraftScenario") -> orbits.Orbit:
         """Return the orbit of the scenario; raise ScenarioError if there is no [orbit] table."""
         return Mission.of(scenario).build_orbit('reference.kind is "nadir"')
 
-    def frequencies(self, scenario: Any) -> dict[str, float]:
+    def frequencies(self, scenario: "SpacecraftScenario") -> dict[str, float]:
         return {"reference.kind": float(self._orbit(scenario).fastest())}
 
     @property
     def mount(self) -> np.ndarray:
         return orbits.nadir_mounting(self.primary_axis, self.secondary_axis)
 
-    def build(self, scenario: Any) -> Any:
+    def build(self, scenario: "SpacecraftScenario") -> references.Reference:
         return jax.tree.map(vector, self.part_class(q=IDENTITY, mount=self.mount, orbit=self._orbit(scenario)))
 
-    def initial_frame(self, scenario: Any) -> np.ndarray:
+    def initial_frame(self, scenario: "SpacecraftScenario") -> np.ndarray:
         place = self._orbit(scenario)(np.zeros(()), np)
         return np.stack([place.radial, place.along, place.normal], axis=1)
 
@@ -289,11 +292,13 @@ class NadirTable(MissionTable, frozen=True):
 class DirectionsTable(MissionTable, frozen=True):
     """References with a primary and a secondary direction."""
 
-    def directions(self, mission: Mission) -> tuple[Any, Any]:
+    def directions(self, mission: Mission) -> tuple[orbits.Direction, orbits.Direction]:
         """Return the primary and the secondary direction, parts of `signals.orbits`."""
         raise NotImplementedError
 
-    def numpy_part(self, mission: Mission, anchors: np.ndarray = IDENTITY[None], rate: float = 0.0) -> Any:
+    def numpy_part(
+        self, mission: Mission, anchors: np.ndarray = IDENTITY[None], rate: float = 0.0
+    ) -> orbits.TwoVectorReference:
         """Build the reference with NumPy numbers."""
         primary, secondary = self.directions(mission)
         needs_orbit = any(isinstance(one, orbits.OrbitDirection | orbits.GroundPoint) for one in (primary, secondary))
@@ -303,16 +308,16 @@ class DirectionsTable(MissionTable, frozen=True):
             anchors=anchors, anchor_rate=np.float64(rate),
         )  # fmt: skip
 
-    def frequencies(self, scenario: Any) -> dict[str, float]:
+    def frequencies(self, scenario: "SpacecraftScenario") -> dict[str, float]:
         return {"reference.kind": _sample(self, Mission.of(scenario)).fastest}
 
-    def build(self, scenario: Any) -> Any:
+    def build(self, scenario: "SpacecraftScenario") -> references.Reference:
         mission = Mission.of(scenario)
         samples = _sample(self, mission)
         part = self.numpy_part(mission, samples.anchors, len(samples.anchors) / samples.span)
         return jax.tree.map(vector, part)
 
-    def initial_frame(self, scenario: Any) -> np.ndarray:
+    def initial_frame(self, scenario: "SpacecraftScenario") -> np.ndarray:
         return _sample(self, Mission.of(scenario)).matrix
 
 
@@ -372,12 +377,12 @@ class GroundTargetTable(DirectionsTable, frozen=True):
     height: Annotated[Number, Meaning("above the WGS-84 ellipsoid", "m")] = 0.0
     secondary: Annotated[Vector, SECONDARY] = "velocity"
 
-    def check(self, scenario: Any) -> None:
+    def check(self, scenario: "SpacecraftScenario") -> None:
         if abs(self.latitude) > LARGEST_LATITUDE:
             raise wrong("reference.latitude", self.latitude, 'from -pi/2 to pi/2 [rad], or with its unit, as "48 deg"')
         super().check(scenario)
 
-    def lowest_elevation(self, scenario: Any) -> tuple[float, float]:
+    def lowest_elevation(self, scenario: "SpacecraftScenario") -> tuple[float, float]:
         """Return the lowest elevation of the spacecraft above the target's horizon [rad], and its time [s]."""
         part, times = self.numpy_part(Mission.of(scenario)), np.linspace(0.0, scenario.end, POINTS)
         to_target, _ = part.directions(times, np)
@@ -388,7 +393,7 @@ class GroundTargetTable(DirectionsTable, frozen=True):
         sines = -np.sum(to_target * up, axis=1)
         return float(np.arcsin(sines.min())), float(times[np.argmin(sines)])
 
-    def directions(self, mission: Mission) -> tuple[Any, Any]:
+    def directions(self, mission: Mission) -> tuple[orbits.Direction, orbits.Direction]:
         point = orbits.ground_point(self.latitude, self.longitude, self.height)
         return orbits.GroundPoint(point), mission.direction("reference.secondary", self.secondary)
 
@@ -401,7 +406,7 @@ class TwoVectorTable(DirectionsTable, frozen=True):
     ] = "sun"  # fmt: skip
     secondary: Annotated[Vector, SECONDARY] = (0.0, 0.0, 1.0)
 
-    def directions(self, mission: Mission) -> tuple[Any, Any]:
+    def directions(self, mission: Mission) -> tuple[orbits.Direction, orbits.Direction]:
         primary = mission.direction("reference.primary", self.primary)
         return primary, mission.direction("reference.secondary", self.secondary)
 

@@ -6,10 +6,10 @@ here return the ends of their ranges.
 """
 
 import math
-from typing import Any
 
 from ptsmc_jax.declare import Scaled
 from ptsmc_jax.scenario import mission
+from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.theory import stability_limits
 
 DEADBEAT_REMAINDER = 5e-5  # remaining fraction of an error after one period that counts as deadbeat
@@ -18,7 +18,7 @@ WIDEST_TO_NOISE = 1e4  # thickest boundary layer relative to the noise of s: the
 NOISELESS_RANGE = (1e-2, 1e2)  # thinnest and thickest boundary layer without noise, relative to the default thickness
 
 
-def dead_beat_gain(scenario: Any) -> float:
+def dead_beat_gain(scenario: Scenario) -> float:
     """Return the gain l [N m s] of a deadbeat observer, equal on all axes.
 
     It decreases the error about the axis of the largest principal moment J to the fraction `DEADBEAT_REMAINDER` in one
@@ -28,7 +28,7 @@ def dead_beat_gain(scenario: Any) -> float:
     return math.log(1.0 / DEADBEAT_REMAINDER) * (1.0 if largest is None else largest) / scenario.loop.period
 
 
-def largest_k1(scenario: Any, surface_rate: float) -> float:
+def largest_k1(scenario: Scenario, surface_rate: float) -> float:
     """Return the largest K1 [1/s] that stabilises the sampled hold phase, 0 if no K1 does.
 
     The function `stability_limits.largest_reaching` returns the limit of K1 h / 2 for a spacecraft (60), and of K1 h
@@ -58,20 +58,20 @@ def narrowest_useful_width(noise: float) -> float:
     return math.sqrt(24.0 * NEGLIGIBLE) / math.pi * noise
 
 
-def largest_surface_rate(scenario: Any) -> float:
+def largest_surface_rate(scenario: Scenario) -> float:
     """Return half of the stability limit of the surface rate c [1/s] in the sampled hold phase, at the best K1."""
     h, delay = scenario.loop.period, scenario.devices.delay_periods
     limit = stability_limits.largest_surface(delay, implicit=scenario.controller.implicit)
     return 0.5 * min(limit, math.log(1.0 / DEADBEAT_REMAINDER)) / h
 
 
-def noiseless_width_range(scenario: Any) -> tuple[float, float]:
+def noiseless_width_range(scenario: Scenario) -> tuple[float, float]:
     """Return widths of the boundary layer to search without noise, in the units of s."""
     width = mission.scales(scenario).scaled_value(scenario.controller.scaled.get("sign_width", Scaled(1e-3)))
     return NOISELESS_RANGE[0] * width, NOISELESS_RANGE[1] * width
 
 
-def width_range(scenario: Any) -> tuple[float, float]:
+def width_range(scenario: Scenario) -> tuple[float, float]:
     """Return the smallest and largest useful boundary layer in the units of s, from the noise of s if it is not 0."""
     noise = scenario.devices.noise_of_s(scenario)
     return (narrowest_useful_width(noise), WIDEST_TO_NOISE * noise) if noise > 0.0 else noiseless_width_range(scenario)

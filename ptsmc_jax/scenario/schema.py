@@ -8,7 +8,7 @@ import dataclasses
 import functools
 import inspect
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import msgspec
 
@@ -16,6 +16,9 @@ from ptsmc_jax import declare
 from ptsmc_jax.declare import Declaration, Scaled
 from ptsmc_jax.numerics.pytrees import pytree, vector
 from ptsmc_jax.scenario.values import UNIT_OF_D, Meaning, Table
+
+if TYPE_CHECKING:
+    from ptsmc_jax.scenario.tables import Scenario
 
 
 class PartTable(Table, frozen=True):
@@ -32,17 +35,17 @@ class PartTable(Table, frozen=True):
     # layer as thin as allowed, because both cost only integration steps.
     free_if_sampled: ClassVar[tuple[str, ...]] = ()
 
-    def part(self, **known_values: Any) -> Any:
+    def part(self, **known_values: object) -> Any:
         """Return the part. Fields that are not in `known_values` get the numbers of the keys with their names."""
         names = [one.name for one in dataclasses.fields(self.part_class) if not one.metadata.get("static")]
         numbers = {name: vector(getattr(self, name)) for name in names if name not in known_values}
         return register_pytree(self.part_class)(**known_values, **numbers)
 
-    def fill_defaults(self, scenario: Any) -> Any:
+    def fill_defaults(self, scenario: "Scenario") -> Self:
         """Return the table with its defaults that depend on other keys, except those in `scaled`."""
         return self
 
-    def complete_for_file(self, scenario: Any) -> Any:
+    def complete_for_file(self, scenario: "Scenario") -> Self:
         """Return the table for a file, with the keys that depend on others of a validated scenario."""
         return self
 
@@ -63,7 +66,7 @@ def register_pytree(part_class: type) -> type:
 
 @functools.cache  # plants share a table, which the reference pages then show once
 def make_table(
-    base: Any, part_class: Any, kind: str, body: bool = True, changes: tuple[tuple[str, Any], ...] = ()
+    base: type[PartTable], part_class: type, kind: str, body: bool = True, changes: tuple[tuple[str, object], ...] = ()
 ) -> Any:
     """Return the table of a class of parts.
 
@@ -79,7 +82,9 @@ def make_table(
     return extend_table(base, part_class, kind, declared, body)
 
 
-def extend_table(base: Any, part_class: Any, kind: str, declared: Mapping[str, Declaration], body: bool) -> Any:
+def extend_table(
+    base: type[PartTable], part_class: type, kind: str, declared: Mapping[str, Declaration], body: bool
+) -> Any:
     """Return a subclass of a table with declared keys; the arguments are those of `make_table`."""
     fields: list[tuple[str, Any, Any]] = [("kind", Literal[kind], kind)]
     for name, declaration in declared.items():

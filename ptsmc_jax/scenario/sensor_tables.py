@@ -5,7 +5,7 @@ Start with `SensorSuite`. `SENSORS` lists the classes by kind.
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import jax.numpy as jnp
 import msgspec
@@ -22,6 +22,9 @@ from ptsmc_jax.scenario.errors import ScenarioError, list_of, wrong
 from ptsmc_jax.scenario.schema import PartTable
 from ptsmc_jax.scenario.values import Kinds, Meaning, NotNegative, Positive, Table, Three
 
+if TYPE_CHECKING:
+    from ptsmc_jax.scenario.tables import Scenario
+
 MAX_LATENCY_PERIODS = 8  # control periods until a reading is used; the filter keeps an attitude for each
 Size = Annotated[float, Meta(ge=1e-15, le=1e3, description="a number from 1e-15 to 1000")]
 Sizes = Annotated[
@@ -37,7 +40,7 @@ class SensorTable(PartTable, frozen=True):
 
     required: ClassVar[tuple[str, ...]] = ()  # keys without a default
 
-    def check(self, place: str, scenario: Any) -> None:
+    def check(self, place: str, scenario: "Scenario") -> None:
         """Raise ScenarioError if a key is missing, or if keys contradict each other; place: place in the file."""
         for key in self.required:
             if getattr(self, key) is None:
@@ -56,7 +59,7 @@ class AttitudeSensorTable(SensorTable, frozen=True):
     ] = None
     latency: Annotated[NotNegative, Meaning("time from a reading until the flight software receives it", "s")] = 0.0
 
-    def check(self, place: str, scenario: Any) -> None:
+    def check(self, place: str, scenario: "Scenario") -> None:
         """Raise ScenarioError also for a wrong mounting, and for a sensor that is too fast, too slow, or very late."""
         super().check(place, scenario)
         if self.boresight is not None and self.rotvec_deg is not None:
@@ -98,7 +101,7 @@ class AttitudeSensorTable(SensorTable, frozen=True):
         """Return the Fisher information (3, 3) of a reading about a small rotation about body axes [1/rad^2]."""
         raise NotImplementedError
 
-    def build(self, name: str, period: float) -> Any:
+    def build(self, name: str, period: float) -> attitude_sensors.AttitudeSensor:
         """Return the part of `devices.attitude_sensors`; name: its name, period: control period [s]."""
         times = attitude_sensors.sample_times(self.interval(period), self.latency, period)
         return self.part(name=name, noise=vector(self.sigmas()), mounting=vector(self.mounting()), times=times)
@@ -108,7 +111,7 @@ class StarTracker(AttitudeSensorTable, frozen=True):
     """A star tracker."""
 
     kind: Literal["star_tracker"] = "star_tracker"
-    part_class: ClassVar[Any] = attitude_sensors.StarTracker
+    part_class: ClassVar[type] = attitude_sensors.StarTracker
     noise_across: Annotated[Noise, Meaning("1 sigma of a reading about each axis across the boresight", "rad")] = None
     noise_about: Annotated[Noise, Meaning("1 sigma of a reading about the boresight; default: noise_across", "rad")] = (
         None
@@ -132,12 +135,12 @@ class VectorSensor(AttitudeSensorTable, frozen=True):
     """A sun sensor or magnetometer: it measures a direction that is known in inertial axes."""
 
     kind: Literal["vector_sensor"] = "vector_sensor"
-    part_class: ClassVar[Any] = attitude_sensors.VectorSensor
+    part_class: ClassVar[type] = attitude_sensors.VectorSensor
     direction: Annotated[Three | None, Meaning("measured direction, in inertial axes")] = None
     noise: Annotated[Noise, Meaning("1 sigma of each component of the direction, in the sensor's axes", "rad")] = None
     required: ClassVar[tuple[str, ...]] = ("direction", "noise")
 
-    def check(self, place: str, scenario: Any) -> None:
+    def check(self, place: str, scenario: "Scenario") -> None:
         """Raise ScenarioError also for a zero direction."""
         super().check(place, scenario)
         attitude_keys.check_direction(f"{place}.direction", self.direction)
@@ -156,7 +159,7 @@ class VectorSensor(AttitudeSensorTable, frozen=True):
         direction = np.array(self.direction, dtype=float)
         return direction / np.linalg.norm(direction)
 
-    def build(self, name: str, period: float) -> Any:
+    def build(self, name: str, period: float) -> attitude_sensors.AttitudeSensor:
         return dataclasses.replace(super().build(name, period), direction=vector(self.unit_direction))
 
 
@@ -180,7 +183,7 @@ class CustomTable(AttitudeSensorTable, frozen=True):
         rows = np.asarray(self.build("custom", 1.0).sensitivity(jnp.array([0.0, 0.0, 0.0, 1.0])))
         return rows.T @ (rows / np.array(self.sigmas())[:, None] ** 2)
 
-    def build(self, name: str, period: float) -> Any:
+    def build(self, name: str, period: float) -> attitude_sensors.AttitudeSensor:
         """Return the sensor; raise ScenarioError if the numbers of noises and of components of a reading differ."""
         sensor = super().build(name, period)
         reading = sensor.read(jnp.array([0.0, 0.0, 0.0, 1.0]))
@@ -206,7 +209,7 @@ class Gyro(SensorTable, frozen=True):
     ] = 0.0
     rate_bias_walk: Annotated[Bias, Meaning("random walk of the bias", "rad/s/sqrt(s)")] = 0.0
 
-    def check(self, place: str, scenario: Any) -> None:
+    def check(self, place: str, scenario: "Scenario") -> None:
         """Raise ScenarioError unless exactly one noise is given."""
         if self.rate_noise is None and self.rate_noise_density is None:
             raise ScenarioError(f"{place}.rate_noise is absent, but must be given, or rate_noise_density")
@@ -233,7 +236,7 @@ class SensorSuite(Table, frozen=True):
     """The tables of [[sensors]]."""
 
     each: tuple[Any, ...]
-    gains: ClassVar[Mapping[str, Any]] = {}
+    gains: ClassVar[Mapping[str, object]] = {}
 
     def tables_by_name(self, name: str) -> dict[str, SensorTable]:
         """Return the tables by their place in a file, such as sensors[0]; name: key of the list."""
@@ -247,7 +250,7 @@ class SensorSuite(Table, frozen=True):
     @property
     def attitude(self) -> dict[str, AttitudeSensorTable]:
         """Return the attitude sensors by name, such as star_tracker_1; exported C uses the same names for inputs."""
-        sensors, counts = dict[str, Any](), dict[str, int]()
+        sensors, counts = dict[str, AttitudeSensorTable](), dict[str, int]()
         for table in self.each:
             kind = table.kind
             counts[kind] = counts.get(kind, 0) + 1
@@ -255,7 +258,7 @@ class SensorSuite(Table, frozen=True):
                 sensors[f"{kind}_{counts[kind]}"] = table
         return sensors
 
-    def check(self, scenario: Any) -> None:
+    def check(self, scenario: "Scenario") -> None:
         """Raise ScenarioError if a sensor is not valid or if the sensors together do not determine the attitude."""
         for place, table in self.tables_by_name("sensors").items():
             table.check(place, scenario)
@@ -296,7 +299,7 @@ class SensorSuite(Table, frozen=True):
             star_tracker_period=interval,
         )  # fmt: skip
 
-    def build(self, model: Any, period: float) -> Any:
+    def build(self, model: object, period: float) -> sensor_suite.SensorSuite:
         """Return the sensors of `devices.sensor_suite`; model: not used, period: control period [s]."""
         sensors = [table.build(name, period) for name, table in self.attitude.items()]
         noise, bias, walk = self.mean_gyro(period)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Collection, Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import msgspec
 import numpy as np
@@ -11,6 +11,7 @@ from msgspec import Meta
 from ptsmc_jax import formulas
 from ptsmc_jax.declare import Scaled
 from ptsmc_jax.numerics.pytrees import vector
+from ptsmc_jax.plants.base import Plant
 from ptsmc_jax.plants.flexible_body import flexible
 from ptsmc_jax.plants.rigid_body import AttitudeState, spacecraft
 from ptsmc_jax.scenario import attitude_keys, device_tables, dispersion_tables, errors, identify_tables, tables
@@ -32,15 +33,19 @@ from ptsmc_jax.scenario.values import (
     Table,
     Three,
 )
+from ptsmc_jax.signals.references import Reference
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.pointing import Pointing as PointingPart
 from ptsmc_jax.simulation.pointing import boresight_frame
+
+if TYPE_CHECKING:
+    from ptsmc_jax.simulation.assembly import Parts
 
 LONGEST_STEP = 0.02  # largest step of the continuous loop in the hold phase / t_f, see `clock`
 # Largest number of integration steps of 0.025 rad in two control periods under a comparison law. A run that turns
 # faster is marked.
 MAX_COMPARISON_STEPS = 50
-_CASE_I: dict[str, Mapping[str, Any]] = {
+_CASE_I: dict[str, Mapping[str, object]] = {
     "initial": {"quat_xyzw": [0.4714045207910317, -0.3333333333333333, 0.5773502691896258, 0.5773502691896258]},
     "reference": {"quat_xyzw": [0.0, 0.0, 0.0, 1.0]},
 }
@@ -104,7 +109,7 @@ class Flexible(Table, frozen=True):
         "coupling": Scaled(((0.8, 0.0, 0.0),), inertia=0.5),
     }
 
-    def check(self, inertia: Any) -> None:
+    def check(self, inertia: Inertia) -> None:
         """Raise ScenarioError for lists of different lengths and for modes that no body can have.
 
         `inertia` is the inertia of the true body [kg m^2].
@@ -120,7 +125,7 @@ class Flexible(Table, frozen=True):
         except ValueError as error:
             raise ScenarioError(f"flexible.coupling is {errors.brief(self.coupling)}: {error}") from None
 
-    def check_random_modes(self, scenario: Any) -> None:
+    def check_random_modes(self, scenario: "SpacecraftScenario") -> None:
         """Raise ScenarioError if random couplings and inertias may be physically impossible.
 
         A random row of D is at most f times the nominal row, and a random moment at least s times the nominal moment.
@@ -162,7 +167,7 @@ class Pointing(Table, frozen=True):
         """Smallest time from t_f to the end of the run [s]: the observation needs two windows."""
         return self.after + 2.0 * self.window
 
-    def check(self, scenario: Any) -> None:
+    def check(self, scenario: "SpacecraftScenario") -> None:
         """Raise ScenarioError for a zero boresight, a short window, or a run that ends before two windows."""
         attitude_keys.check_direction("pointing.boresight", self.boresight)
         t_f, needed = scenario.controller.t_f, scenario.controller.t_f + self.time_after_t_f
@@ -179,7 +184,7 @@ class Pointing(Table, frozen=True):
         if self.window < shortest * (1 - 1e-9):
             raise wrong("pointing.window", self.window, f"at least {source}, {shortest:.9g}")
 
-    def build(self, scenario: Any) -> Any:
+    def build(self, scenario: Any) -> PointingPart:
         """Return `pointing.Pointing`, with the limits whose requirements concern a fraction of the time."""
         limits = {
             name: vector(limit.limit)
@@ -229,12 +234,12 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         "identify": identify_tables.Identify,
     }
     unit_of_d: ClassVar[str] = "N m"
-    metrics: ClassVar[Any] = catalogues.CATALOGUE
+    metrics: ClassVar[Mapping[str, catalogues.Entry]] = catalogues.CATALOGUE
     motion: ClassVar[str] = "spacecraft"
     reaching: ClassVar[float] = 2.0
 
     @classmethod
-    def plant_defaults(cls, plant: Any, given: Collection[str], law: object) -> dict[str, Mapping[str, Any]]:
+    def plant_defaults(cls, plant: Table, given: Collection[str], law: object) -> dict[str, Mapping[str, object]]:
         """Return the attitudes of the published Case I."""
         return _CASE_I
 
@@ -249,21 +254,21 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         return 1
 
     @property
-    def estimator(self) -> Any:
+    def estimator(self) -> device_tables.FilterTable:
         """The table [filter], `NoFilter` if it is absent, or the Kalman filter of [[sensors]]."""
         if isinstance(self.sensors, SensorSuite):
             return device_tables.KalmanFilter()
         return device_tables.NoFilter() if self.filter is None else self.filter
 
     @property
-    def devices(self) -> Any:
+    def devices(self) -> device_tables.Hardware:
         """The table [hardware], with one star tracker and one gyro that are equivalent to [[sensors]]."""
         table = super().devices
         suite = self.sensors
         return suite.equivalent_hardware(table, self.loop.period) if isinstance(suite, SensorSuite) else table
 
     @property
-    def reaction_wheels(self) -> Any:
+    def reaction_wheels(self) -> device_tables.WheelLimits | None:
         """The table [wheels], None without wheels."""
         return self.wheels
 
@@ -323,12 +328,12 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
         noise = self.devices.attitude_noise or 0.0
         return max(1e-3 * min(1.0, self.start_angle() or 1.0), min(5.0 * noise, 1.0))
 
-    def fill_plant_defaults(self) -> Any:
+    def fill_plant_defaults(self) -> Self:
         """Return the scenario with the defaults of the filter."""
         return msgspec.structs.replace(self, filter=None if self.filter is None else self.filter.fill_defaults(self))
 
     @property
-    def true_inertia(self) -> Any:
+    def true_inertia(self) -> Inertia:
         """Inertia of the true body, three moments or a tensor (3, 3) [kg m^2]."""
         table = self.spacecraft
         return table.inertia if table.true_inertia is None else table.true_inertia
@@ -371,27 +376,27 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
     def check_reference_until(self, last: float) -> None:
         self.reference.check_reference_until(self, last, "tune.bounds.t_f")
 
-    def observation(self) -> Any:
+    def observation(self) -> PointingPart | None:
         """Return the observation of pointing errors, None without [pointing]."""
         return None if self.pointing is None else self.pointing.build(self)
 
-    def design_model(self) -> Any:
+    def design_model(self) -> Plant:
         """Return the rigid body of the design model."""
         return spacecraft(self.spacecraft.inertia)
 
-    def true_plant(self, model: Any) -> Any:
+    def true_plant(self, model: Plant) -> Plant:
         """Return the true plant: the body with its true inertia and its flexible modes; model: not used."""
         modes = self.flexible
         if modes is None:
             return spacecraft(self.true_inertia)
         return flexible(self.true_inertia, modes.frequency, modes.damping, modes.coupling)
 
-    def initial_state(self) -> Any:
+    def initial_state(self) -> AttitudeState:
         """Return attitude and rate at t = 0."""
         q = vector(attitude_keys.quaternion(self.initial, "initial"))
         return AttitudeState(q, vector(self.initial.rate))
 
-    def build_reference(self) -> Any:
+    def build_reference(self) -> Reference:
         """Return the reference."""
         return self.reference.build(self)
 
@@ -404,7 +409,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
             rates[f"dispersion.rate.{table.width_key}"] = float(table.norm_quantile * table.widths()[0])
         return rates
 
-    def frequencies(self, setup: Any, t_f: float) -> dict[str, float]:
+    def frequencies(self, setup: "Parts", t_f: float) -> dict[str, float]:
         """Return the angular frequencies of start, reference, law, wheels and flexible modes [rad/s], by key.
 
         Args:

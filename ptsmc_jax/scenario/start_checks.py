@@ -4,6 +4,7 @@ Start with `check`.
 """
 
 import typing
+from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
@@ -13,16 +14,19 @@ from jaxtyping import Array
 from ptsmc_jax import programs
 from ptsmc_jax.batching import lapack
 from ptsmc_jax.dispersions.base import INITIAL_ATTITUDE, REFERENCE
+from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.plants.second_order import System
 from ptsmc_jax.scenario import attitude_keys, errors
 from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.signals.references import Target
 from ptsmc_jax.simulation.rollout import SINGULAR_DISTANCE, Parts
 from ptsmc_jax.theory import solutions
 
 SINGULAR_CONDITION = 1e14  # condition number of a matrix that counts as singular in double precision
 
 
-def check(scenario: Any, parts: Parts, dispersion: Any, *, dispersed: bool) -> None:
+def check(scenario: Scenario, parts: Parts, dispersion: Dispersion, *, dispersed: bool) -> None:
     """Raise ScenarioError if the law meets its singularity on the nominal path, or if it must invert a singular matrix.
 
     Trials with random attitudes are not checked here: a trial that meets the singularity is marked in the results.
@@ -42,7 +46,7 @@ def check(scenario: Any, parts: Parts, dispersion: Any, *, dispersed: bool) -> N
             check_attitude_path(scenario, parts)
 
 
-def check_system(scenario: Any, parts: Parts) -> None:
+def check_system(scenario: Scenario, parts: Parts) -> None:
     """Raise ScenarioError if a system is not finite at t = 0, or if law or observer cannot invert it there."""
     start, plant = (jnp.zeros(()), parts.initial), typing.cast(System, parts.controller.model)
     _check_finite("system", plant, *start)
@@ -97,7 +101,7 @@ def check_reference_path(scenario: Any, parts: Parts) -> None:
 
 
 @programs.jit
-def _scalar_part(reference: Any, times: Array) -> Array:
+def _scalar_part(reference: Callable[[Array], Target], times: Array) -> Array:
     """Return q_f4 of a reference at the times (n,) [s]."""
     return lapack.vmap(lambda time: reference(time).q[3])(times)
 

@@ -5,13 +5,16 @@ Start with `ChainScenario` and `SystemScenario`.
 
 import math
 from collections.abc import Collection, Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import msgspec
+from jax import Array
 from msgspec import Meta
 
 from ptsmc_jax.numerics.pytrees import vector
+from ptsmc_jax.plants.base import Plant
 from ptsmc_jax.plants.integrator_chain import chain
+from ptsmc_jax.plants.second_order import System
 from ptsmc_jax.scenario import device_tables, dispersion_tables, errors, identify_tables, systems, tables
 from ptsmc_jax.scenario.custom import SENSORS
 from ptsmc_jax.scenario.disturbance_tables import DISTURBANCES
@@ -20,7 +23,7 @@ from ptsmc_jax.scenario.law_tables import LAWS, OBSERVERS
 from ptsmc_jax.scenario.tables import Loop, Scenario, Tune
 from ptsmc_jax.scenario.values import Kinds, Meaning, Numbers, Table
 from ptsmc_jax.signals.references import CurrentTime, Origin
-from ptsmc_jax.simulation.catalogues import STATE_CATALOGUE
+from ptsmc_jax.simulation.catalogues import STATE_CATALOGUE, Entry
 
 _PRESCRIBED_TIME = "prescribed_time"
 
@@ -81,9 +84,9 @@ def tables_by_name(plant: type[Table], kind: str) -> dict[str, type[Table] | Kin
 class StateScenario(Scenario, frozen=True, kw_only=True):
     """Base class of scenarios of chains and systems."""
 
-    metrics: ClassVar[Any] = STATE_CATALOGUE
+    metrics: ClassVar[Mapping[str, Entry]] = STATE_CATALOGUE
 
-    def fill_plant_defaults(self) -> Any:
+    def fill_plant_defaults(self) -> Self:
         """Return the scenario with one width of the dispersed initial state for each state."""
         dispersed = getattr(self.dispersion, "x0", None)
         if dispersed is None:
@@ -117,7 +120,7 @@ class StateScenario(Scenario, frozen=True, kw_only=True):
                 if value is not None and len(value) != m:
                     raise wrong(f"{place}.{key}", value, errors.list_of(m, "input"))
 
-    def initial_state(self) -> Any:
+    def initial_state(self) -> Array:
         """Return the state x0."""
         return vector(self.plant.x0)
 
@@ -129,7 +132,7 @@ class ChainScenario(StateScenario, frozen=True, kw_only=True):
     motion: ClassVar[str] = "chain"
 
     @classmethod
-    def plant_defaults(cls, plant: Any, given: Collection[str], law: object) -> dict[str, Mapping[str, Any]]:
+    def plant_defaults(cls, plant: Any, given: Collection[str], law: object) -> dict[str, Mapping[str, object]]:
         """Return the defaults of a chain: the published cases of Figs. 1 and 2 for the orders 2 and 3.
 
         All laws have the published t_f. Surfaces of all orders have their poles at -1. If the order is absent, it is
@@ -167,11 +170,11 @@ class ChainScenario(StateScenario, frozen=True, kw_only=True):
         if len(self.plant.x0) != n:
             raise wrong("plant.x0", self.plant.x0, f"a list of plant.order = {n} numbers")
 
-    def design_model(self) -> Any:
+    def design_model(self) -> Plant:
         """Return the chain."""
         return chain(self.plant.order)
 
-    def build_reference(self) -> Any:
+    def build_reference(self) -> Origin:
         """Return the reference, rest at the origin."""
         return Origin()
 
@@ -183,7 +186,7 @@ class SystemScenario(StateScenario, frozen=True, kw_only=True):
     motion: ClassVar[str] = "system"
 
     @classmethod
-    def plant_defaults(cls, plant: Any, given: Collection[str], law: object) -> dict[str, Mapping[str, Any]]:
+    def plant_defaults(cls, plant: Any, given: Collection[str], law: object) -> dict[str, Mapping[str, object]]:
         """Return the published t_f of a chain; raise ScenarioError if x0 has an odd length."""
         if len(plant.x0) % 2:
             raise wrong("plant.x0", plant.x0, "a list of x_1 followed by x_2, as many numbers each")
@@ -208,15 +211,15 @@ class SystemScenario(StateScenario, frozen=True, kw_only=True):
             elif value is not None:
                 self._load_system(key)
 
-    def design_model(self) -> Any:
+    def design_model(self) -> System:
         """Return the design model, plant.system; raise ScenarioError if it cannot be loaded."""
         return self._load_system("system")
 
-    def true_plant(self, model: Any) -> Any:
+    def true_plant(self, model: Plant) -> Plant:
         """Return the true plant, plant.truth or the design model; raise ScenarioError if it cannot be loaded."""
         return model if self.plant.truth is None else self._load_system("truth")
 
-    def _load_system(self, key: str) -> Any:
+    def _load_system(self, key: str) -> System:
         """Return the system of a key, and run its file if the key names one."""
         value = getattr(self.plant, key)
         try:
@@ -238,6 +241,6 @@ class SystemScenario(StateScenario, frozen=True, kw_only=True):
             raise wrong("plant.x0", self.plant.x0, f"a list of {2 * n} numbers, since plant.{key} has n = {n}")
         return system
 
-    def build_reference(self) -> Any:
+    def build_reference(self) -> CurrentTime:
         """Return the time as the reference: x_1 is already an error."""
         return CurrentTime()

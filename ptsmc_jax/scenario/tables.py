@@ -4,15 +4,18 @@ A table is a struct. The annotation of each field holds meaning, unit and allowe
 and the scenario reference are made from them. Start with `Scenario`.
 """
 
-from collections.abc import Collection, Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from collections.abc import Callable, Collection, Mapping
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import msgspec
+from jax import Array
 from msgspec import Meta
 
 from ptsmc_jax.declare import Scaled
+from ptsmc_jax.plants.base import Plant, State
 from ptsmc_jax.scenario import epochs, keys
-from ptsmc_jax.scenario.device_tables import NoFilter
+from ptsmc_jax.scenario.device_tables import FilterTable, NoFilter, WheelLimits
+from ptsmc_jax.scenario.disturbance_tables import DisturbanceTable
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.scenario.values import (
@@ -27,6 +30,10 @@ from ptsmc_jax.scenario.values import (
     Truth,
 )
 from ptsmc_jax.simulation.catalogues import Entry
+from ptsmc_jax.simulation.pointing import Pointing
+
+if TYPE_CHECKING:
+    from ptsmc_jax.simulation.assembly import Parts
 
 
 class Loop(Table, frozen=True):
@@ -242,7 +249,7 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
         return type(self).__name__ + "".join(f"\n  {name}: {table!r}" for name, table in tables.items() if table)
 
     @classmethod
-    def plant_defaults(cls, plant: Any, given: Collection[str], law: object) -> dict[str, Mapping[str, Any]]:
+    def plant_defaults(cls, plant: Any, given: Collection[str], law: object) -> dict[str, Mapping[str, object]]:
         """Return defaults that depend on the plant and the law, by table and key.
 
         Args:
@@ -273,7 +280,7 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
         return getattr(self.controller, "sign_width", None) == 0.0
 
     @property
-    def terms(self) -> tuple[Any, ...]:
+    def terms(self) -> tuple[DisturbanceTable, ...]:
         """The disturbances that act together, one for [disturbance] unless it is a sum."""
         return tuple(self.terms_by_place.values())
 
@@ -304,12 +311,12 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
         return table() if self.hardware is None else self.hardware
 
     @property
-    def estimator(self) -> Any:
+    def estimator(self) -> FilterTable:
         """The table [filter], `NoFilter` if it is absent."""
         return NoFilter()
 
     @property
-    def reaction_wheels(self) -> Any:
+    def reaction_wheels(self) -> WheelLimits | None:
         """The table [wheels], None without wheels."""
         return None
 
@@ -396,15 +403,15 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
         """The length of the window after t_f, `loop.window` [s]."""
         return self.loop.window
 
-    def observation(self) -> Any:
+    def observation(self) -> Pointing | None:
         """Return the observation of pointing errors, a part of `simulation.pointing`, or None."""
         return None
 
-    def fill_plant_defaults(self) -> Any:
+    def fill_plant_defaults(self) -> Self:
         """Return the scenario with the defaults of its plant that depend on other keys."""
         return self
 
-    def complete_for_file(self) -> Any:
+    def complete_for_file(self) -> Self:
         """Return the scenario for a file, with all keys that depend on other keys filled in."""
         return msgspec.structs.replace(self, observer=self.observer.complete_for_file(self))
 
@@ -420,23 +427,23 @@ class Scenario(Table, frozen=True, kw_only=True, eq=False):
     def check_reference_until(self, last: float) -> None:
         """Raise ScenarioError if the reference ends before `last` [s], the end of the longest run of a search."""
 
-    def design_model(self) -> Any:
+    def design_model(self) -> Plant:
         """Return the design model of law and observer, a part of `plants`."""
         raise NotImplementedError
 
-    def true_plant(self, model: Any) -> Any:
+    def true_plant(self, model: Plant) -> Plant:
         """Return the true plant; model: the design model, which is the default."""
         return model
 
-    def initial_state(self) -> Any:
+    def initial_state(self) -> State:
         """Return the initial state."""
         raise NotImplementedError
 
-    def build_reference(self) -> Any:
+    def build_reference(self) -> Callable[[Array], object]:
         """Return the reference, a part of `signals.references`."""
         raise NotImplementedError
 
-    def frequencies(self, setup: Any, t_f: float) -> dict[str, float]:
+    def frequencies(self, setup: "Parts", t_f: float) -> dict[str, float]:
         """Return the angular frequencies of the plant's motion [rad/s], by the key that causes each of them.
 
         Args:

@@ -17,8 +17,10 @@ import numpy as np
 
 from ptsmc_jax import programs
 from ptsmc_jax.batching import lapack
-from ptsmc_jax.laws.prescribed_time import PrescribedTime
+from ptsmc_jax.laws.prescribed_time import PrescribedTime, PrescribedTimeLaw
 from ptsmc_jax.numerics.pytrees import vector
+from ptsmc_jax.observers.base import Observer
+from ptsmc_jax.plants.base import State
 from ptsmc_jax.plants.second_order import System
 from ptsmc_jax.scenario.errors import ScenarioError, show, wrong
 from ptsmc_jax.scenario.tables import Scenario, check_scenario
@@ -99,7 +101,9 @@ def reach_of(scenario: Scenario, **changes: float) -> Reach:
     return reach
 
 
-def choose_timing(scenario: Scenario, setup: Parts, reach: Reach, saves: object) -> tuple[Any, int]:
+def choose_timing(
+    scenario: Scenario, setup: Parts, reach: Reach, saves: object
+) -> tuple[clock.Anchored | clock.Flight | clock.Graded, int]:
     """Return the clock of a run, and the number of integration steps in a control period.
 
     Args:
@@ -190,7 +194,7 @@ def _too_fast_error(scenario: Scenario, key: str, reason: str) -> ScenarioError:
 
 
 @programs.jit  # compiled as one program instead of one for each operation
-def _layer_rates(controller: Any, observer: Any, visited: Any) -> tuple:
+def _layer_rates(controller: PrescribedTimeLaw, observer: Observer, visited: tuple | None) -> tuple:
     """Return the fastest rates in the boundary layer before and after the hand-over [1/s]."""
     return envelopes.boundary_layer(controller, observer.error_bound().largest, visited)
 
@@ -210,11 +214,11 @@ def _system_rates(setup: Parts, visited: tuple) -> tuple:
     plant, kinematics = typing.cast(System, setup.plant), setup.controller.kinematics
     zero = jnp.zeros(plant.inputs)
 
-    def jacobian(t: Any, x: Any) -> Any:
+    def jacobian(t: jax.Array, x: State) -> jax.Array:
         u = kinematics.invert(x, t, zero, zero)
         return plant.jacobian(t, plant.with_hidden_at_rest(x), u)
 
-    def zero_error_acceleration(t: Any) -> Any:
+    def zero_error_acceleration(t: jax.Array) -> jax.Array:
         return solutions.plant_motion(kinematics, t, setup.initial, (zero, zero, zero)).w_dot
 
     times = setup.t_end * jnp.linspace(0.0, 1.0, 509)  # 509 is prime, so that the samples rarely alias with a period
@@ -235,7 +239,9 @@ def _with_gain(observer: Any, gain: float) -> Any:
     return dataclasses.replace(observer, gain=vector(np.full(np.shape(observer.gain), gain)))
 
 
-def _fastest_layer_rates(reach: Reach, law: Any, observer: Any, visited: Any) -> tuple[float, float]:
+def _fastest_layer_rates(
+    reach: Reach, law: PrescribedTimeLaw, observer: Observer, visited: tuple | None
+) -> tuple[float, float]:
     """Return the fastest rates of boundary layer and observer before and after the hand-over, within reach [1/s]."""
     before = after = 0.0
     if hasattr(observer, "gain"):  # the smallest gain gives the largest K2, the largest gain the fastest observer
@@ -249,7 +255,12 @@ def _fastest_layer_rates(reach: Reach, law: Any, observer: Any, visited: Any) ->
 
 
 def _continuous_grid(
-    scenario: Scenario, reach: Reach, setup: Parts, saves: object, frequencies: Mapping[str, float], visited: Any
+    scenario: Scenario,
+    reach: Reach,
+    setup: Parts,
+    saves: object,
+    frequencies: Mapping[str, float],
+    visited: tuple | None,
 ) -> clock.Graded:
     """Return the grid of the continuous loop; raise ScenarioError if it needs more than `MOST_STEPS` steps."""
     loop = scenario.loop
