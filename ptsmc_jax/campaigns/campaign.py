@@ -3,10 +3,9 @@
 A trial does not depend on the parts, so shards, clusters and interrupted runs give the same rows.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -90,7 +89,7 @@ class Campaign:
 
         def call_and_check(result: rollout.Result, parts: Parts) -> dict[str, jax.Array]:
             try:
-                returned: Any = function(result, parts)
+                returned: object = function(result, parts)
             except (Exception, SystemExit) as error:
                 file = getattr(getattr(function, "__code__", None), "co_filename", "")
                 raise ValueError(f"it {custom_checks.describe_failure(error, file)}") from error
@@ -117,7 +116,7 @@ class Campaign:
         return list(simulated.custom_metrics)
 
 
-def _sample_count_columns(samples: dict[str, Any]) -> dict[str, Any]:
+def _sample_count_columns(samples: Mapping[str, jax.Array | np.ndarray]) -> dict[str, jax.Array | np.ndarray]:
     """Return the numbers of samples by column name, given the numbers by the status that the C code returned."""
     return {f"{run_tables.COUNT_PREFIX}{status}": count for status, count in samples.items()}
 

@@ -8,12 +8,15 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.campaign import Block, Campaign, count_failures
 from ptsmc_jax.campaigns.rows import Part, Rows
 from ptsmc_jax.campaigns.store import RefusedError
+
+if TYPE_CHECKING:
+    from distributed import Client, LocalCluster
 
 ALLOWED_LOSSES = 5  # the campaign fails if more workers than this are lost while they simulate the same part
 _one_at_a_time = threading.Lock()  # because a part uses all devices of its process
@@ -22,7 +25,7 @@ _one_at_a_time = threading.Lock()  # because a part uses all devices of its proc
 class Cluster:
     """A connection to a cluster. A call with a folder and the wanted parts simulates these parts on its workers."""
 
-    def __init__(self, client: Any, local: Any = None):
+    def __init__(self, client: "Client", local: "LocalCluster | None" = None):
         self._client, self._local = client, local
 
     def __call__(self, folder: Any, wanted: list[Block]) -> Iterator[tuple[Part, int]]:

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import jax
 import numpy as np
@@ -82,8 +81,8 @@ class Run:
         log, sensors = self.log, self.parts.sensors
         if log.readings is None or log.sent is None:
             return {}
-        readings: dict[str, Any] = dict(log.readings)
-        columns: dict[str, Any] = {}
+        readings: dict[str, ArrayLike] = dict(log.readings)
+        columns: dict[str, ArrayLike] = {}
         tracker = getattr(sensors, "star_tracker", None)
         if tracker is not None:  # the sensors are a suite
             readings["attitude"] = np.asarray(jax.vmap(tracker.body)(readings[tracker.name]))

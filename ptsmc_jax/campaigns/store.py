@@ -177,9 +177,9 @@ def describe_difference(folder: Path, scenario: Tables, made_by: Tables) -> str 
     return None
 
 
-def _values_by_key(tables: Tables) -> dict[str, Any]:
+def _values_by_key(tables: Tables) -> dict[str, object]:
     """Return the values of a scenario by the names of their keys, such as loop.period or sensors[0].period."""
-    values: dict[str, Any] = {}
+    values: dict[str, object] = {}
     for name, content in tables.items():
         listed = {f"{name}[{k}]": table for k, table in enumerate(content)} if isinstance(content, list) else {}
         for place, table in (listed or {name: content}).items():
@@ -391,7 +391,7 @@ def to_json_value(value: Any) -> Any:
     return value
 
 
-def _name_objects(value: Any) -> Any:
+def _name_objects(value: object) -> Any:
     """Return tables with names instead of objects made in Python; reading refuses such a name."""
     if isinstance(value, Mapping):
         return {k: _name_objects(v) for k, v in value.items()}

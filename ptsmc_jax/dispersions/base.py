@@ -157,7 +157,7 @@ not_negative = validator(lambda numbers: numbers >= 0.0, "numbers of at least 0"
 positive = validator(lambda numbers: numbers > 0.0, "a number greater than 0")
 
 
-def error_message(check: Callable[..., Any], *values: Any) -> str:
+def error_message(check: Callable[..., object], *values: object) -> str:
     """Return the message of the ValueError that a check raises for these values, or "" if it raises none."""
     try:
         check(*values)

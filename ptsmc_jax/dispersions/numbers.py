@@ -100,17 +100,17 @@ def any_attitude() -> RandomNumbers:
 Combine = Callable[[Random, Numbers, Any], Numbers]
 
 
-def replace_nominal(random: Random, nominal: Numbers, parts: Any) -> Random:
+def replace_nominal(random: Random, nominal: Numbers, parts: object) -> Random:
     """Return the random numbers (n,) [SI units], without the nominal ones."""
     return random
 
 
-def add_to_nominal(random: Random, nominal: Numbers, parts: Any) -> Numbers:
+def add_to_nominal(random: Random, nominal: Numbers, parts: object) -> Numbers:
     """Return nominal numbers plus random numbers (n,) [SI units]."""
     return nominal + random
 
 
-def scale_nominal(random: Random, nominal: Numbers, parts: Any) -> Numbers:
+def scale_nominal(random: Random, nominal: Numbers, parts: object) -> Numbers:
     """Return nominal numbers (n,) [SI units] times 1 + random number [-].
 
     Each random number scales a group of n / count successive numbers.
@@ -119,12 +119,12 @@ def scale_nominal(random: Random, nominal: Numbers, parts: Any) -> Numbers:
     return jnp.ravel(groups * (1.0 + random)[:, None])
 
 
-def rotate_nominal(random: Random, nominal: Numbers, parts: Any) -> Numbers:
+def rotate_nominal(random: Random, nominal: Numbers, parts: object) -> Numbers:
     """Return the nominal attitude (4,) rotated by a random rotation vector (3,) [rad]."""
     return attitude.multiply(nominal, attitude.from_rotation_vector(random))
 
 
-def rotate_about_axis(random: Random, nominal: Numbers, parts: Any) -> Numbers:
+def rotate_about_axis(random: Random, nominal: Numbers, parts: object) -> Numbers:
     """Return the nominal attitude (4,) rotated about a random axis; see `axis_angle` for the numbers [-, rad, rad]."""
     z, azimuth, angle = random[0], random[1], random[2]
     radius = jnp.sqrt(1.0 - z * z)

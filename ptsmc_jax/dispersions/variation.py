@@ -143,7 +143,7 @@ class TrialSetup(NamedTuple):
     parts: Parts  # nominal parts, with the given values of the row
     dispersion: Dispersion  # of the quantities that are not given
     seed: WholeNumber
-    trial: Any
+    trial: WholeNumber
     given: tuple[str, ...]  # names of the quantities with given values
 
     @property
