@@ -30,7 +30,7 @@ from ptsmc_jax.devices.command_filter import CommandFilter
 from ptsmc_jax.devices.kalman_filter import KalmanFilter, Track
 from ptsmc_jax.laws.base import Law, Sample
 from ptsmc_jax.numerics import attitude, guards
-from ptsmc_jax.observers.base import Observer
+from ptsmc_jax.observers.base import Memory, Observer
 from ptsmc_jax.onboard import derived, origins
 from ptsmc_jax.plants.base import Plant, State
 from ptsmc_jax.plants.rigid_body import AttitudeState
@@ -51,7 +51,7 @@ class Stage:
     name: str
     description: str
     run: Callable[[Values, Values], Values]  # (parameters, all values) -> values that it writes, by name
-    parts: tuple[Any, ...] = ()  # parts whose docstrings the C function has as a comment
+    parts: tuple[object, ...] = ()  # parts whose docstrings the C function has as a comment
 
 
 @dataclass
@@ -59,10 +59,10 @@ class Board:
     """The flight computer of a scenario: shapes of its values by name, their meanings, and its stages."""
 
     model: Plant  # design model of the plant
-    parameters: dict[str, Any]
-    inputs: dict[str, Any] = field(default_factory=dict)
-    state: dict[str, Any] = field(default_factory=dict)
-    outputs: dict[str, Any] = field(default_factory=dict)
+    parameters: Values
+    inputs: Values = field(default_factory=dict)
+    state: Values = field(default_factory=dict)
+    outputs: Values = field(default_factory=dict)
     stages: list[Stage] = field(default_factory=list)
     rules: list[derived.Rule] = field(default_factory=list)  # rules that derive parameters from other parameters
     meanings: dict[str, str] = field(default_factory=dict)  # meaning of each value, by name
@@ -173,7 +173,7 @@ def _with_reference_input(computer: Board) -> Board:
     return computer
 
 
-def board_parameters(parts: Parts) -> dict[str, Any]:
+def board_parameters(parts: Parts) -> Values:
     """Return the parameters of the flight computer by name [SI units]. They belong to the design model."""
     observer, sensors, period = parts.observer, parts.sensors, parts.period
     parameters = {
@@ -363,7 +363,7 @@ def _add_observer_stage(computer: Board, observer: Observer, device: Actuators) 
         model = observer.model
         before, now = computer.measured_state(values, "before"), computer.measured_state(values, "now")
 
-        def update_observer() -> Any:
+        def update_observer() -> Memory:
             applied = values[torque_name]
             if telemetry_shapes:
                 momentum, limited = values["before.wheel_momentum"], jnp.zeros((), bool)
@@ -414,7 +414,7 @@ def _add_law_stage(computer: Board, law: Law, observer: Observer, command_filter
         now, reference = computer.measured_state(values, "now"), parameters["reference"](t)
         hold = t >= law.hand_over - guards.time_tolerance(period, law.hand_over)  # the tolerance of `clock.Flight`
 
-        def evaluate_law() -> tuple[Any, Any, dict[str, Any]]:
+        def evaluate_law() -> tuple[jax.Array, jax.Array, Values]:
             sample, k2 = Sample(t, hold, period, memory_before["law"]), parameters["bound"](t)
             u, s, law_memory = law(sample, now, reference, values["out.d_hat"], k2)
             u, s = (jnp.asarray(v, jnp.result_type(float)) for v in (u, s))  # a custom law may return integers

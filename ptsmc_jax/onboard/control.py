@@ -2,19 +2,23 @@
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jax.extend.core import JaxprEqn
 
 from ptsmc_jax.batching.components import object_array
 from ptsmc_jax.batching.dependence import split_scan_operands, unpack_while
 from ptsmc_jax.onboard.expressions import BOOL, Block, Node, Region, kind_of
 
+if TYPE_CHECKING:
+    from ptsmc_jax.onboard.translate import Translator
+
 MAX_UNROLLED_PASSES = 8  # largest number of passes of an unrolled loop
 MAX_UNROLLED_OPERATIONS = 200  # largest number of operations of an unrolled loop
 
 
-def _add_block(translator: Any, region: Region, translate_block: Callable[[], list[np.ndarray]]) -> None:
+def _add_block(translator: "Translator", region: Region, translate_block: Callable[[], list[np.ndarray]]) -> None:
     """Add a block to a region. `translate_block` returns the components of the block's outputs."""
     outer = translator.pool.block
     translator.pool.block = Block(outer)
@@ -27,20 +31,22 @@ def _flatten(arrays: Sequence[np.ndarray]) -> list[Node]:
     return [node for array in arrays for node in array.flat]
 
 
-def _new_variables(translator: Any, variables: Sequence[Any]) -> list[np.ndarray]:
+def _new_variables(translator: "Translator", variables: Sequence[Any]) -> list[np.ndarray]:
     """Return new C variables for the components of these variables of the jaxpr."""
     return [object_array(aval.shape, (translator.pool.new_variable(kind_of(aval.dtype)) for _ in range(aval.size)))
             for aval in (variable.aval for variable in variables)]  # fmt: skip
 
 
-def _begin_loop(translator: Any, region: Region, init: Sequence[np.ndarray], variables: Any) -> list[np.ndarray]:
+def _begin_loop(
+    translator: "Translator", region: Region, init: Sequence[np.ndarray], variables: Any
+) -> list[np.ndarray]:
     """Return the C variables of a loop's state, with these components as initial values."""
     region.initial, state = _flatten(init), _new_variables(translator, variables)
     region.carried = _flatten(state)
     return state
 
 
-def _end_region(translator: Any, region: Region, variables: Sequence[Any]) -> list[np.ndarray]:
+def _end_region(translator: "Translator", region: Region, variables: Sequence[Any]) -> list[np.ndarray]:
     """Append a finished region to the current block. Return the C variables of its results."""
     results = _new_variables(translator, variables)
     region.results += _flatten(results)
@@ -52,7 +58,7 @@ def _end_region(translator: Any, region: Region, variables: Sequence[Any]) -> li
     return results
 
 
-def translate_cond(translator: Any, eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
+def translate_cond(translator: "Translator", eqn: JaxprEqn, values: list[np.ndarray]) -> list[np.ndarray]:
     """Translate lax.cond and lax.switch: C runs one of the branches.
 
     Args:
@@ -86,7 +92,7 @@ def translate_cond(translator: Any, eqn: Any, values: list[np.ndarray]) -> list[
     return translate_first(len(branches))
 
 
-def translate_while(translator: Any, eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
+def translate_while(translator: "Translator", eqn: JaxprEqn, values: list[np.ndarray]) -> list[np.ndarray]:
     """Translate lax.while_loop; see `translate_cond` for arguments and result."""
     test, body, test_consts, body_consts, init = unpack_while(eqn, values)
     region = Region("while")

@@ -16,6 +16,7 @@ from ptsmc_jax.devices.actuators import Actuators
 from ptsmc_jax.devices.attitude_filter import filter_gains
 from ptsmc_jax.devices.kalman_filter import KalmanFilter
 from ptsmc_jax.numerics import matrices
+from ptsmc_jax.numerics.pytrees import Scalar
 from ptsmc_jax.simulation.assembly import Parts
 
 Values = dict[str, Any]  # the parameters by name, see `board.board_parameters`
@@ -80,7 +81,7 @@ def with_wheel_allocation(device: Actuators) -> Actuators:
     return replace(device, wheels=replace(device.wheels, allocation=allocation))
 
 
-def shortest_filter_bandwidth(sensors: Any, period: Any) -> np.ndarray:
+def shortest_filter_bandwidth(sensors: Any, period: Scalar) -> np.ndarray:
     """Return the bandwidth of the sensors' attitude filter [rad/s], as the shortest number that gives its gains."""
     exact_bandwidth = float(sensors.bandwidth(period))
     interval = float(period) * sensors.every if sensors.own_times is None else float(sensors.own_times.interval)

@@ -66,9 +66,9 @@ class Block:
 
     def __init__(self, outer: "Block | None" = None):
         self.outer, self.nodes = outer, []
-        self.nodes_by_key: dict[Any, Node] = {}
+        self.nodes_by_key: dict[tuple, Node] = {}
 
-    def find(self, key: Any) -> Node | None:
+    def find(self, key: tuple) -> Node | None:
         """Return the node with this key in this block or an enclosing block, or None."""
         return self.nodes_by_key.get(key) or (self.outer.find(key) if self.outer else None)
 
@@ -99,7 +99,7 @@ EVALUATORS: dict[str, Callable] = {
 }
 
 
-def kind_of(dtype: Any) -> str:
+def kind_of(dtype: object) -> str:
     """Return the kind of the numbers of a dtype; empty if C does not have it, see `KINDS`."""
     return KINDS.get(str(dtype), "")
 
@@ -126,7 +126,7 @@ class Pool:
         self.block = self.outermost = Block()
         self.section = ""
 
-    def constant(self, value: Any, kind: str) -> Node:
+    def constant(self, value: float, kind: str) -> Node:
         """Return the node of a constant."""
         value = bool(value) if kind == BOOL else float(value) if kind == REAL else int(value)
         # distinguish 0.0 and -0.0, which are equal; find nan, which is not equal to itself
@@ -137,7 +137,7 @@ class Pool:
         """Return the node of a place in memory."""
         return self._atom(("place", name), kind, name)
 
-    def _atom(self, key: Any, kind: str, value: Any) -> Node:
+    def _atom(self, key: tuple, kind: str, value: float | str) -> Node:
         """Return the node of a constant or a place, whose operation is the first entry of the key."""
         return self.block.find(key) or self._store(key, Node(key[0], (), kind, value, self.outermost))
 
@@ -152,12 +152,12 @@ class Pool:
         node.section = self.section
         return node
 
-    def _store(self, key: Any, node: Node) -> Node:
+    def _store(self, key: tuple, node: Node) -> Node:
         """Record a new node under its key, so that `Block.find` finds it, and return the node."""
         node.block.nodes_by_key[key] = node
         return node
 
-    def make(self, op: str, *args: Node, kind: str = REAL, value: Any = None) -> Node:
+    def make(self, op: str, *args: Node, kind: str = REAL, value: object = None) -> Node:
         """Return the node of an operation; equal operations give the same node.
 
         Args:

@@ -62,7 +62,7 @@ class Field:
         return object_array(self.shape, (pool.place(prefix + element, self.kind) for element in self.elements()))
 
 
-def struct_fields(trees: Mapping[str, Any], meanings: Mapping[str, str]) -> dict[str, list[Field]]:
+def struct_fields(trees: Mapping[str, object], meanings: Mapping[str, str]) -> dict[str, list[Field]]:
     """Return the fields of a struct, in order.
 
     Args:
@@ -89,7 +89,7 @@ def struct_fields(trees: Mapping[str, Any], meanings: Mapping[str, str]) -> dict
     return fields
 
 
-def _names_and_meaning(path: Any, tree: Any) -> tuple[list[str], str]:
+def _names_and_meaning(path: tuple, tree: object) -> tuple[list[str], str]:
     """Return the names of the attributes and entries that lead to a leaf, and its meaning from the source."""
     names, meaning, owner = [], "", tree
     for key in path:
@@ -102,7 +102,7 @@ def _names_and_meaning(path: Any, tree: Any) -> tuple[list[str], str]:
     return names, meaning
 
 
-def _declared_meaning(part: Any, name: str) -> str:
+def _declared_meaning(part: object, name: str) -> str:
     """Return meaning, unit and allowed values of a field of a part, empty if its class does not declare them."""
     known = getattr(type(part), "__dataclass_fields__", {})
     declared = known[name].metadata.get("declared") if name in known else None
@@ -117,8 +117,8 @@ def _declared_meaning(part: Any, name: str) -> str:
 class Parameters:
     """The leaves of the parameters and their fields in C, in the struct "p" (set) or "d" (derived)."""
 
-    structure: Any
-    leaves: list[Any]
+    structure: Any  # `PyTreeDef`
+    leaves: list[jax.Array]
     fields: list[Field]  # field of each leaf; leaves that are the same array share a field
     values: dict[str, np.ndarray]  # values by name
     derived: set[str] = field(default_factory=set)  # names of derived parameters
@@ -147,10 +147,10 @@ class Parameters:
             member.name for member in self.fields if f"{self.struct_pointer(member)}->{member.name}" in read_names
         }
 
-    def trace(self, rules: Iterable[Rule]) -> Any:
+    def trace(self, rules: Iterable[Rule]) -> core.ClosedJaxpr:
         """Return the jaxpr that applies rules to the leaves."""
 
-        def apply_rules(leaves: list[Any]) -> list[Any]:
+        def apply_rules(leaves: list[jax.Array]) -> list[jax.Array]:
             values = jax.tree.unflatten(self.structure, leaves)
             for rule in rules:
                 values = rule(values)

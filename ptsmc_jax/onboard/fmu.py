@@ -11,9 +11,9 @@ import sys
 import tempfile
 import zipfile
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -95,7 +95,9 @@ def list_variables(model: Model) -> list[Variable]:
     """Return the variables of an FMU in the order of their value references."""
     code = model.code
 
-    def make(fields: Iterable[Field], role: str, values: dict[str, Any], prefix: str = "") -> Iterable[Variable]:
+    def make(
+        fields: Iterable[Field], role: str, values: Mapping[str, np.ndarray | float], prefix: str = ""
+    ) -> Iterable[Variable]:
         for field in fields:
             kind = {REAL: "r", "uint32_t": "u"}.get(field.kind, "i")
             start = np.broadcast_to(values.get(field.name, _default_start(field)), field.shape)
@@ -125,7 +127,7 @@ def _short_meaning(comment: str) -> str:
     return re.sub(r"; default: [^[]*(?=\[)", " ", text)
 
 
-def _default_start(field: Field) -> Any:
+def _default_start(field: Field) -> list[float] | float:
     """Return the start value of an input: the identity for a quaternion, otherwise zero."""
     return [0.0, 0.0, 0.0, 1.0] if field.shape == (4,) and "wheel" not in field.name else 0.0
 

@@ -4,7 +4,7 @@ import hashlib
 import json
 import re
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -98,11 +98,11 @@ def simulate(controller: Controller, seed: int, trials: int) -> dict[int, vector
 
 def vector_table(
     controller: Controller, samples_by_trial: dict[int, vectors.Samples]
-) -> tuple[list[str], list[list[Any]]]:
+) -> tuple[list[str], list[list[float]]]:
     """Return the header and the rows of vectors.csv."""
     columns = controller.code.columns
     names = [f"{kind}.{name}" for kind in ("in", "out", "state") for name in columns[kind]]
-    rows: list[list[Any]] = []
+    rows: list[list[float]] = []
     for k, samples in samples_by_trial.items():
         inputs, outputs, state = vectors.rows(controller.board, samples)
         zeros = [0.0] * (inputs.shape[1] + outputs.shape[1])

@@ -2,7 +2,6 @@
 
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import Any
 
 import jax
 import numpy as np
@@ -12,7 +11,7 @@ from ptsmc_jax.laws.base import AccelerationLaw, Law
 from ptsmc_jax.laws.kinematics import AttitudeKinematics, Kinematics
 from ptsmc_jax.observers.base import Observer
 from ptsmc_jax.onboard import origins, printing
-from ptsmc_jax.onboard.board import SCALARS, Board, Stage
+from ptsmc_jax.onboard.board import SCALARS, Board, Stage, Values
 from ptsmc_jax.onboard.expressions import Node, Pool, kind_of, name_nodes
 from ptsmc_jax.onboard.fields import Field, Parameters, collect_parameters, struct_fields
 from ptsmc_jax.onboard.translate import Translator
@@ -121,7 +120,7 @@ def _add_stage_function(code: Code, board: Board, stage: Stage, structs: dict[st
     shapes |= {f"{prefix}.{key}": shape for prefix, struct in STRUCTS.items()
                for key, shape in getattr(board, struct).items()}  # fmt: skip
 
-    def run_stage(parameter_leaves: list[Any], values: list[Any]) -> dict[str, Any]:
+    def run_stage(parameter_leaves: list[jax.Array], values: list) -> Values:
         """Return the values that the stage writes, by name, given all values in the order of `shapes`."""
         parameters = jax.tree.unflatten(params.structure, parameter_leaves)
         return stage.run(parameters, dict(zip(shapes, values, strict=True)))

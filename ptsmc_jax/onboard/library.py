@@ -21,12 +21,16 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from ptsmc_jax.devices.actuators import ActuatorState
+from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.dispersions.variation import Dispersion
+from ptsmc_jax.numerics.draws import WholeNumber
+from ptsmc_jax.observers.base import Bound
 from ptsmc_jax.onboard import sources
-from ptsmc_jax.onboard.board import board_parameters, build_board
+from ptsmc_jax.onboard.board import Values, board_parameters, build_board
 from ptsmc_jax.onboard.fields import COMPUTED, collect_parameters, name_parameters
 from ptsmc_jax.onboard.generate import column_names
 from ptsmc_jax.onboard.templates import fill_template, with_public_prefix
+from ptsmc_jax.plants.base import State
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.computer import PYTHON_SOFTWARE, SAMPLE_STATUSES, Computer, Decision, Period, Software
@@ -176,7 +180,7 @@ class InTheLoop:
                 f"loop.period is {period!s} s, but must be {c_period!s} s as in the controller in {library.folder}"
             )
         # the first column of each parameter in C, by its path
-        self._columns, columns = dict[Any, int](), {name: k for k, name in enumerate(library.columns["params"])}
+        self._columns, columns = dict[tuple, int](), {name: k for k, name in enumerate(library.columns["params"])}
         leaves = jax.tree_util.tree_leaves_with_path(self.board.parameters)
         for (path, _), member in zip(leaves, name_parameters(self.board).fields, strict=True):
             if member.size and member.elements()[0] in columns:
@@ -193,7 +197,7 @@ class InTheLoop:
         for rule in params.rules:
             updated = rule(updated)
         drawn_leaves, updated_leaves = (dict(jax.tree_util.tree_leaves_with_path(tree)) for tree in (drawn, updated))
-        first_values = dict[str, Any]()
+        first_values = dict[str, jax.Array]()
         pairs = zip(jax.tree_util.tree_leaves_with_path(self.board.parameters), params.fields, strict=True)
         for (path, _), field in sorted(pairs, key=lambda item: item[0][0][0].key in COMPUTED):
             value = drawn_leaves[path]
@@ -223,7 +227,7 @@ class InTheLoop:
         rest = f" and {len(differing) - MOST_LISTED} more" if len(differing) > MOST_LISTED else ""
         return f"the controller has other parameters than the scenario: {', '.join(differing[:MOST_LISTED])}{rest}"
 
-    def boot(self, parts: Parts, seed: Any, trial: Any, x0: Any, first: Any) -> Computer:
+    def boot(self, parts: Parts, seed: WholeNumber, trial: WholeNumber, x0: State, first: Ticks) -> Computer:
         """Return the flight computer before the first sample, with the state of `ptsmc_init`.
 
         The state of an attitude filter is replaced by that of a filter that has run before the manoeuvre.
@@ -243,7 +247,14 @@ class InTheLoop:
         return computer._replace(sensors=(computer.sensors, state, jnp.zeros(len(SAMPLE_STATUSES), jnp.int32)))
 
     def decide(
-        self, parts: Parts, k2: Any, period: Period, computer: Computer, x: Any, star_x: Any, acting: ActuatorState
+        self,
+        parts: Parts,
+        k2: Bound,
+        period: Period,
+        computer: Computer,
+        x: State,
+        star_x: State,
+        acting: ActuatorState,
     ) -> tuple[Decision, Computer]:
         """Return the decision of `ptsmc_step` for a control period, and the flight computer after it.
 
@@ -277,11 +288,11 @@ class InTheLoop:
         memories = memory["observer"], memory["law"], computer.applied, memory.get("command_filter")
         return decision, Computer((sensing, after, counts), measured, *memories)
 
-    def statuses(self, computer: Computer) -> dict[str, Any]:
+    def statuses(self, computer: Computer) -> dict[str, jax.Array]:
         """Return the number of samples of a run with each status."""
         return dict(zip(SAMPLE_STATUSES, computer.sensors[2], strict=True))
 
-    def _changed_parameters(self, parts: Parts) -> Any:
+    def _changed_parameters(self, parts: Parts) -> jax.Array:
         """Return the parameters (columns,) that a trial changes, with NaN for unchanged ones."""
         changed = jnp.full(len(self.library.columns["params"]), jnp.nan)
         trees = (board_parameters(source) for source in (parts, self.nominal))
@@ -292,7 +303,7 @@ class InTheLoop:
         return changed
 
 
-def _tree_reader(shapes: dict[str, Any]) -> Callable[[Any], dict[str, Any]]:
+def _tree_reader(shapes: Values) -> Callable[[jax.Array], Values]:
     """Return the function from a row, which may be longer than necessary, to trees of these shapes by name."""
     zeros = [jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape) for shape in shapes.values()]
     flat, unravel = ravel_pytree(zeros)

@@ -6,9 +6,11 @@ import inspect
 import re
 import textwrap
 from pathlib import Path
+from types import CodeType
 from typing import Any, NamedTuple
 
 import jax
+from jax.extend.core import JaxprEqn
 
 JAX = Path(jax.__file__).parent
 WRAPPERS = ("jaxtyping", "beartype", "<")  # parts of file names of wrappers, whose stack frames are ignored
@@ -27,7 +29,7 @@ class Frame(NamedTuple):
     span: Span
 
 
-def stack_frames(eqn: Any) -> list[Frame]:
+def stack_frames(eqn: JaxprEqn) -> list[Frame]:
     """Return the stack frames of an equation, the innermost first, without frames of JAX."""
     trace = eqn.source_info.traceback
     code_objects, instructions = ((), ()) if trace is None else trace.raw_frames()
@@ -44,7 +46,7 @@ def _is_foreign(file: str) -> bool:
 
 
 @functools.cache
-def _instruction_spans(code: Any) -> list[Span]:
+def _instruction_spans(code: CodeType) -> list[Span]:
     return [(a or 0, c or 0, b or 0, d or 0) for a, b, c, d in code.co_positions()]
 
 
@@ -152,7 +154,7 @@ def summary(docstring: str | None) -> str:
     return " ".join((docstring or "").strip().split("\n\n")[0].split())
 
 
-def class_docstrings(part: Any, common_bases: tuple[type, ...]) -> list[tuple[str, str]]:
+def class_docstrings(part: object, common_bases: tuple[type, ...]) -> list[tuple[str, str]]:
     """Return (class, docstring) of a part's class and its base classes, up to the common ones."""
     docstrings = []
     for cls in type(part).__mro__:

@@ -1,19 +1,20 @@
 """The true plant of a scenario as stages for C: actuators, disturbance, motion, sensors. Read `plant_board` first."""
 
 from dataclasses import replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.dispersions.variation import Dispersion
-from ptsmc_jax.observers.base import NoObserver
+from ptsmc_jax.numerics.draws import WholeNumber
+from ptsmc_jax.observers.base import Bound, NoObserver
 from ptsmc_jax.onboard import derived
 from ptsmc_jax.onboard.board import Board, Stage, Values
 from ptsmc_jax.onboard.fmu import FILTER_STATE
+from ptsmc_jax.plants.base import State as PlantState
 from ptsmc_jax.simulation.assembly import Parts
-from ptsmc_jax.simulation.computer import Computer, Decision, Software
+from ptsmc_jax.simulation.computer import Computer, Decision, Period, Software
 from ptsmc_jax.simulation.control_period import State, Tick, Vehicle, control_period, start
 
 # the parts of a run that make up the plant; the reference is one, because initial attitudes may be relative to it
@@ -91,7 +92,7 @@ _MEANINGS = {
 }
 
 
-def _plant_parts(parts: Parts) -> dict[str, Any]:
+def _plant_parts(parts: Parts) -> Values:
     """Return the parts of `PARTS` by name."""
     return {name: getattr(parts, name) for name in PARTS if getattr(parts, name) is not None}
 
@@ -127,26 +128,26 @@ def _draw_trial(parts: Parts, dispersion: Dispersion, values: Values) -> Parts:
     return replace(drawn, actuators=replace(drawn.actuators, torque_limit=None))
 
 
-def _period_ticks(parts: Parts, sample: Any) -> Ticks:
+def _period_ticks(parts: Parts, sample: jax.Array) -> Ticks:
     """Return a control period of the flight clock by the number of its sample."""
     t, t_next = (number.astype(float) * parts.period for number in (sample, sample + 1))
     return Ticks(t, t_next, jnp.asarray(False), sample, jnp.ones(()), jnp.asarray(False))
 
 
-def _constant_command_software(command: Any) -> Software:
+def _constant_command_software(command: jax.Array) -> Software:
     """Return flight software that always commands the same input (m,) [N m]."""
     zero = jnp.zeros_like(command)
 
-    def boot(parts: Parts, seed: Any, trial: Any, x0: Any, first: Ticks) -> Computer:
+    def boot(parts: Parts, seed: WholeNumber, trial: WholeNumber, x0: PlantState, first: Ticks) -> Computer:
         return Computer(parts.sensors.begin(seed, trial, x0, first), None, None, None, (zero, None))
 
-    def decide(parts: Parts, k2: Any, period: Any, computer: Computer, *_: Any) -> tuple[Decision, Computer]:
+    def decide(parts: Parts, k2: Bound, period: Period, computer: Computer, *_: object) -> tuple[Decision, Computer]:
         return Decision(None, zero, command, zero, zero), computer
 
     return Software(boot, decide)
 
 
-def _start_plant(parts: Parts, seed: Any, trial: Any) -> tuple[Vehicle, State]:
+def _start_plant(parts: Parts, seed: WholeNumber, trial: WholeNumber) -> tuple[Vehicle, State]:
     """Return the constants of the run, and its state at the first sample."""
     ticks = jax.tree.map(lambda v: v[None], _period_ticks(parts, jnp.int32(0)))
     # the plant needs no observer, which may have no counterpart in C
@@ -154,7 +155,7 @@ def _start_plant(parts: Parts, seed: Any, trial: Any) -> tuple[Vehicle, State]:
     return start(parts, ticks, parts.initial, seed, trial, _constant_command_software(jnp.zeros(parts.plant.inputs)))
 
 
-def _state_and_outputs(parts: Parts, state: State, sample: Any, controller: Board) -> Values:
+def _state_and_outputs(parts: Parts, state: State, sample: jax.Array, controller: Board) -> Values:
     """Return the state and the outputs at a sample, by name, after its readings.
 
     Args:

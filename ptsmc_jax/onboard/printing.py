@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from string import Template
-from typing import Any
 
 from ptsmc_jax.numerics import guards
 from ptsmc_jax.onboard.expressions import BOOL, REAL, Block, Node, Region, Title
@@ -61,7 +60,7 @@ def _read_helpers() -> dict[str, str]:
 HELPERS = _read_helpers()
 
 
-def format_constant(value: Any, kind: str) -> str:
+def format_constant(value: float, kind: str) -> str:
     """Return a constant in C."""
     if kind == BOOL:
         return "1" if value else "0"

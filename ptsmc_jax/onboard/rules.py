@@ -1,7 +1,7 @@
 """The counterpart of each elementwise primitive in C."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax.numpy as jnp
@@ -49,13 +49,13 @@ def convert(pool: Pool, kind: str, x: Node) -> Node:
     return pool.make("convert", x, kind=kind)
 
 
-def _convert_element_type(pool: Pool, params: Any, kind: str, x: Node) -> Node:
+def _convert_element_type(pool: Pool, params: Mapping[str, Any], kind: str, x: Node) -> Node:
     if kind == REAL and jnp.finfo(params["new_dtype"]).bits < jnp.finfo(jnp.result_type(float)).bits:
         raise KeyError("convert_element_type")  # C does not round to fewer digits
     return convert(pool, kind, x)
 
 
-def _reduce_precision(pool: Pool, params: Any, kind: str, x: Node) -> Node:
+def _reduce_precision(pool: Pool, params: Mapping[str, Any], kind: str, x: Node) -> Node:
     real = jnp.finfo(jnp.result_type(float))
     if params["exponent_bits"] < real.nexp or params["mantissa_bits"] < real.nmant:
         raise KeyError("reduce_precision")
@@ -67,7 +67,7 @@ def _same_operation(op: str) -> Callable:
 
 
 def _bool_operation(op: str) -> Callable:
-    def rule(pool: Pool, params: Any, kind: str, *x: Node) -> Node:
+    def rule(pool: Pool, params: object, kind: str, *x: Node) -> Node:
         if kind != BOOL:
             raise KeyError(op)  # operations on the bits of integers have no rule
         return pool.make(op, *x, kind=BOOL)
@@ -75,7 +75,7 @@ def _bool_operation(op: str) -> Callable:
     return rule
 
 
-def _select(pool: Pool, params: Any, kind: str, selector: Node, *cases: Node) -> Node:
+def _select(pool: Pool, params: object, kind: str, selector: Node, *cases: Node) -> Node:
     if selector.kind == BOOL:
         no, yes = cases
         return pool.make("select", selector, yes, no, kind=kind)
@@ -89,7 +89,7 @@ def _select(pool: Pool, params: Any, kind: str, selector: Node, *cases: Node) ->
 def _division_rule(op: str) -> Callable:
     """Return the rule of a quotient or remainder. As in XLA, k / 0 is -1 and k % 0 is k for integers."""
 
-    def rule(pool: Pool, params: Any, kind: str, a: Node, b: Node) -> Node:
+    def rule(pool: Pool, params: object, kind: str, a: Node, b: Node) -> Node:
         if kind == REAL:
             return pool.make("fmod" if op == "rem" else op, a, b)
         is_zero = pool.make("eq", b, pool.constant(0, kind), kind=BOOL)

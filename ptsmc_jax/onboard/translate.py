@@ -15,6 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn
 
 from ptsmc_jax.batching import components
 from ptsmc_jax.batching.components import object_array
@@ -53,7 +54,7 @@ class Translator:
         self.pool = pool
         self.outer_frames: list[origins.Frame] | None = None  # stack frames of the call that is being translated
 
-    def constant(self, array: Any) -> np.ndarray:
+    def constant(self, array: jax.typing.ArrayLike) -> np.ndarray:
         """Return the components of a constant array."""
         dtype = jnp.result_type(array)
         kind = kind_of(dtype)
@@ -64,7 +65,7 @@ class Translator:
             raise NoRuleError(f"a constant array has {array.size} numbers, but must have at most {MAX_CONSTANTS} in C")
         return object_array(array.shape, (self.pool.constant(v, kind) for v in array.reshape(-1)))
 
-    def evaluate(self, closed: Any, args: Sequence[np.ndarray]) -> list[np.ndarray]:
+    def evaluate(self, closed: ClosedJaxpr | Jaxpr, args: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Return the components of a jaxpr's outputs, given the components of its inputs."""
         jaxpr, consts = open_jaxpr(closed)
         all_frames = [self.outer_frames or origins.stack_frames(eqn) for eqn in jaxpr.eqns]
@@ -72,7 +73,7 @@ class Translator:
         is_last = [frames[:1] != following[:1] for frames, following in itertools.pairwise([*all_frames, []])]
         frames_in_order = zip(all_frames, is_last, strict=True)
 
-        def translate(eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
+        def translate(eqn: JaxprEqn, values: list[np.ndarray]) -> list[np.ndarray]:
             frames, has_value = next(frames_in_order)
             outer, self.pool.section = self.pool.section, origins.section_heading(frames) or self.pool.section
             results = self.translate_equation(eqn, values, frames)
@@ -162,7 +163,7 @@ class Translator:
         rule = partial(ELEMENTWISE[name], pool, eqn.params, kind)
         return _map_entries(rule, values, aval.shape)
 
-    def unsupported_error(self, eqn: Any, frames: list[origins.Frame]) -> NoRuleError:
+    def unsupported_error(self, eqn: JaxprEqn, frames: list[origins.Frame]) -> NoRuleError:
         """Return the error for a primitive without a rule: function and line in the source, and allowed functions."""
         primitive, (function, line) = eqn.primitive.name, origins.describe_call(frames)
         allowed = ALLOWED_LINEAR_ALGEBRA if primitive in LINEAR_ALGEBRA else ALLOWED_OPERATIONS
@@ -170,7 +171,7 @@ class Translator:
             f"`{function or primitive}`{f' ({line})' if line else ''} cannot be written in C, but must be {allowed}"
         )
 
-    def _index_of_extreme(self, eqn: Any, value: np.ndarray, kind: str) -> np.ndarray:
+    def _index_of_extreme(self, eqn: JaxprEqn, value: np.ndarray, kind: str) -> np.ndarray:
         test = "gt" if eqn.primitive.name == "argmax" else "lt"
 
         def index_of_extreme(entries: np.ndarray) -> Node:
@@ -183,7 +184,7 @@ class Translator:
 
         return components.reduce_entries(eqn, value, index_of_extreme)
 
-    def _select_by_index(self, eqn: Any, values: Sequence[np.ndarray]) -> np.ndarray:
+    def _select_by_index(self, eqn: JaxprEqn, values: Sequence[np.ndarray]) -> np.ndarray:
         """Translate a primitive with indices: at a computed index, C selects among the results for all indices.
 
         Raises:
@@ -214,7 +215,7 @@ class Translator:
         return result
 
     def _read_table_row(
-        self, eqn: Any, values: Sequence[np.ndarray], arrays: Sequence[np.ndarray], index: Node
+        self, eqn: JaxprEqn, values: Sequence[np.ndarray], arrays: Sequence[np.ndarray], index: Node
     ) -> np.ndarray | None:
         """Translate a row of a parameter array at a computed index to table[index] in C; None for other operations.
 
@@ -282,7 +283,7 @@ def _map_entries(rule: Callable, values: Sequence[np.ndarray], shape: tuple[int,
     return object_array(shape, map(rule, *(np.broadcast_to(value, shape).flat for value in values)))
 
 
-def _fill_value(eqn: Any) -> Any:
+def _fill_value(eqn: Any) -> float:
     """Return the value of a gather outside of the array; by default NaN, or an extreme of the integer type."""
     dtype, value = eqn.outvars[0].aval.dtype, eqn.params["fill_value"]
     if value is None and jnp.issubdtype(dtype, jnp.integer):

@@ -4,7 +4,7 @@ Read `simulate` first.
 """
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,8 @@ from ptsmc_jax.dispersions.base import REFERENCE
 from ptsmc_jax.dispersions.quantities import level_name
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.numerics import stacking
-from ptsmc_jax.onboard.board import Board
+from ptsmc_jax.numerics.draws import WholeNumber
+from ptsmc_jax.onboard.board import Board, Values
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.control_period import State, Tick, control_period, schedule, start
 from ptsmc_jax.simulation.run_state import SINGULAR_DISTANCE
@@ -28,15 +29,15 @@ class Samples(NamedTuple):
 
     t: Array  # time [s].
     has_length: Array  # bool: whether the period has a nonzero length.
-    inputs: dict[str, Any]  # inputs of the flight computer.
+    inputs: Values  # inputs of the flight computer.
     before: dict[str, Array]  # attitude filter before the sample, see `Sensor.filter_state`.
-    state: dict[str, Any]  # state of the flight computer after the sample.
-    outputs: dict[str, Any]  # outputs of the flight computer.
+    state: Values  # state of the flight computer after the sample.
+    outputs: Values  # outputs of the flight computer.
     error: Array  # error of the measured state.
     limited: Array  # bool: whether a limit reduces the command.
 
 
-def simulate(parts: Parts, dispersion: Dispersion, seed: Any, trial: Any) -> Samples:
+def simulate(parts: Parts, dispersion: Dispersion, seed: WholeNumber, trial: WholeNumber) -> Samples:
     """Simulate a trial without timing jitter and return its samples.
 
     Args:
@@ -144,7 +145,7 @@ def first_state(board: Board, samples: Samples) -> np.ndarray:
     return np.column_stack([np.zeros((1, 3)), *columns])[0]
 
 
-def _flatten_columns(shapes: dict[str, Any], values: dict[str, Any]) -> np.ndarray:
+def _flatten_columns(shapes: Values, values: Values) -> np.ndarray:
     """Flatten pytrees (samples, ..) by name to a table (samples, columns); `shapes` has the order of the names."""
     leaves = [np.asarray(leaf, dtype=float) for name in shapes for leaf in jax.tree.leaves(values[name])]
     return np.column_stack([leaf.reshape(len(leaf), -1) for leaf in leaves])
