@@ -6,7 +6,7 @@ Its amplitudes maximise log det of the Fisher information, within the limits of 
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -46,7 +46,7 @@ class Design:
 
 
 def design(
-    what: Scenario | str | Any,
+    what: Scenario | str | Path,
     duration: float = 300.0,
     *,
     rate: float = DEFAULT_RATE,
@@ -115,7 +115,7 @@ def design(
 
 
 def _momentum_scaler(
-    loaded: Any, problem: Problem, rate: float, torque: float | None
+    loaded: Scenario, problem: Problem, rate: float, torque: float | None
 ) -> Callable[[np.ndarray], np.ndarray]:
     """Return a function that scales a momentum profile (rows, m) [N m s] to 95 % of the tightest limit.
 
@@ -155,7 +155,7 @@ def _slew_each_axis(t: np.ndarray, inputs: int) -> np.ndarray:
     return momentum
 
 
-def _log_at_rest(loaded: Any, t: np.ndarray) -> Measurements:
+def _log_at_rest(loaded: Scenario, t: np.ndarray) -> Measurements:
     """Return a synthetic log of a plant at rest, with readings at the sample times of the scenario's sensors."""
     if loaded.plant.kind != "spacecraft":
         x = np.tile(np.asarray(loaded.plant.x0, float), (len(t), 1))

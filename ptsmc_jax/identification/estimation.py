@@ -8,7 +8,7 @@ come from the derivatives of the innovations in forward mode.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -259,7 +259,7 @@ class Search:
             )
             return (innovations.value, innovations.variance), innovations
 
-        def differentiate_along(directions: Array) -> Any:  # the part of one device
+        def differentiate_along(directions: Array) -> tuple:  # the part of one device
             derive = jax.vmap(lambda d: jax.jvp(innovations_at, (z,), (d,), has_aux=True)[1:], out_axes=(-1, None))
             return jax.tree.map(lambda v: v[None], derive(directions[0]))
 
@@ -480,8 +480,8 @@ def _build_result(
     problem: Problem,
     search: Search,
     best: SearchResult,
-    logs: Sequence[Any],
-    validation_logs: Sequence[Any],
+    logs: Sequence[Measurements],
+    validation_logs: Sequence[Measurements],
 ) -> Identification:
     z, zero, has_prior = best.z, np.zeros(problem.size), problem.has_prior()
     z_covariance, by_z, by_start = covariance(best.information), problem.derivatives(z), problem.derivatives(zero)

@@ -7,6 +7,7 @@ independent noise and correct the state one after the other. Each innovation is 
 (Bierman, Factorization Methods for Discrete Sequential Estimation, 1977, chapter 2). Read `run_filter` first.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -20,6 +21,7 @@ from ptsmc_jax.devices.actuators import Actuators, Drive
 from ptsmc_jax.identification.telemetry import Measurements
 from ptsmc_jax.numerics import attitude, guards, integrators, matrices
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
+from ptsmc_jax.plants.base import Plant, State
 from ptsmc_jax.plants.rigid_body import AttitudeState
 
 MAX_STEPS = 10_000_000  # largest number of integration steps of a log
@@ -74,7 +76,7 @@ class Innovations(NamedTuple):
 class FilterState(NamedTuple):
     """Estimates and covariance of the filter at a row, or at many rows with a leading axis."""
 
-    x: Any  # state of the plant
+    x: State  # state of the plant
     bias: Any  # (3,) gyro bias [rad/s]
     walk: Any  # (m,) random-walk torque [N m]
     covariance: Any  # (n, n) of the errors of state, bias and torque
@@ -182,7 +184,7 @@ def run_filter(
     model: Model,
     rows: Rows,
     kind: LogKind,
-    gate: Any = jnp.inf,
+    gate: Scalar | float = jnp.inf,
     *,
     with_track: bool = True,
     covariance_derivatives: bool = True,
@@ -201,7 +203,7 @@ def run_filter(
     acting = acting_command(model, rows, kind.wheel_inertia)
     carry = _initial_carry(model, rows)
 
-    def step(carry: FilterState, row: Any) -> tuple[FilterState, tuple[Innovations, FilterState | None]]:
+    def step(carry: FilterState, row: tuple) -> tuple[FilterState, tuple[Innovations, FilterState | None]]:
         t, dt, command, acting, readings, valid = row
         carry = _predict(model, carry, t, dt, command, acting, kind)
         carry = carry if covariance_derivatives else carry._replace(covariance=jax.lax.stop_gradient(carry.covariance))
@@ -275,7 +277,7 @@ def _predict(
         drive = drive._replace(c=acting) if kind.by_channel else drive
     torque = actuators.torque_over(drive, jnp.zeros_like(dt), dt)
 
-    def state_rate(time: Scalar, y: Any, walk: Array) -> Any:
+    def state_rate(time: Scalar, y: State, walk: Array) -> State:
         d = model.disturbance(time, y)
         return plant.rate(time, y, torque.torque_at(time - t, plant.velocity(y)), d + walk if walk.size else d)
 
@@ -301,7 +303,9 @@ def _predict(
     return carry._replace(x=after, covariance=p, actuators=state)
 
 
-def _transition_matrix(plant: Any, rate: Any, carry: FilterState, after: Any, t: Scalar, dt: Scalar) -> Array:
+def _transition_matrix(
+    plant: Plant, rate: Callable[[Scalar, State, Array], State], carry: FilterState, after: State, t: Scalar, dt: Scalar
+) -> Array:
     """Return the transition matrix of the state and the random-walk torque over an interval.
 
     It is e^(A dt) to fourth order. A has the derivatives of the rate of the local coordinates in the middle of the
@@ -325,7 +329,7 @@ def _transition_matrix(plant: Any, rate: Any, carry: FilterState, after: Any, t:
 
 
 def _correct(
-    model: Model, carry: FilterState, readings: dict[str, Array], valid: Array, gate: Any
+    model: Model, carry: FilterState, readings: dict[str, Array], valid: Array, gate: Scalar | float
 ) -> tuple[FilterState, Innovations]:
     """Return the filter corrected by the readings of a row, one component after the other, and the innovations."""
     residuals, derivatives, noise = _compute_residuals(model, carry, readings)

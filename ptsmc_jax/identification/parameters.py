@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import keystr, tree_flatten_with_path
+from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from ptsmc_jax.devices.actuators import Actuators
@@ -30,6 +31,7 @@ from ptsmc_jax.scenario.parsing import nearest_name_hint
 from ptsmc_jax.scenario.sensor_tables import SensorSuite
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.signals import disturbances
+from ptsmc_jax.simulation.assembly import Parts
 
 # parameters of sensors that only [hardware] has, and that [[sensors]] replaces
 HARDWARE_PARAMETERS = ("attitude_noise", "rate_noise", "gyro_scale", "star_tracker_misalignment")
@@ -166,7 +168,7 @@ def build(scenario: Scenario, logs: Sequence[Measurements], names: Sequence[str]
 
 
 def _build_model(
-    scenario: Any, table: Identify, setup: Any, logs: Sequence[Measurements], with_bias: bool
+    scenario: Scenario, table: Identify, setup: Parts, logs: Sequence[Measurements], with_bias: bool
 ) -> tuple[Model, list[str]]:
     """Return the model of the scenario, and the names of the noises that it does not state. These are estimated."""
     devices, plant = scenario.devices, setup.plant
@@ -246,7 +248,7 @@ def _hidden_sigma(plant: Any, logs: Sequence[Measurements]) -> Array:
 
 
 def _possible_parameters(
-    scenario: Any, model: Model, logs: Sequence[Measurements], log_interval: float, prior: Any
+    scenario: Scenario, model: Model, logs: Sequence[Measurements], log_interval: float, prior: object
 ) -> dict[str, Callable[[], Parameter]]:
     """Return a function that makes each parameter of the scenario, by name.
 
@@ -281,7 +283,7 @@ def _possible_parameters(
     def add_vector(name: str, unit: str, kind: str, path: str, count: int) -> None:
         """Add the numbers at a path of the model, (count,). If the model has None there, they are 1."""
 
-        def get(model: Model) -> Any:
+        def get(model: Model) -> ArrayLike:
             value = paths.get(model, path)
             return 1.0 if value is None else value
 
@@ -379,7 +381,7 @@ def _number_parameter(
     return Parameter(name, labels, unit, np.diag(sigmas), has_prior, write, read, common)
 
 
-def _leaf_parameter(path: str, model: Model, place: int, leaf: Any) -> Parameter:
+def _leaf_parameter(path: str, model: Model, place: int, leaf: ArrayLike) -> Parameter:
     """Return the parameter of a leaf of a custom plant, whose number among the leaves is `place`."""
     start = np.asarray(leaf)
     sizes = np.where(start == 0.0, np.max(np.abs(start), initial=0.0) or 1.0, np.abs(start))
@@ -436,7 +438,7 @@ def _coupling_parameter(model: Model, sigmas: np.ndarray, has_prior: bool) -> Pa
     return parameter._replace(labels=labels)
 
 
-def _inertia_parameter(start: np.ndarray, prior: Any) -> Parameter:
+def _inertia_parameter(start: np.ndarray, prior: object) -> Parameter:
     """Return the inertia parameter, in log-Cholesky coordinates of the pseudo-inertia. Every value is physical."""
     table = getattr(prior, "inertia", None)
     root = vector(numbers.pseudo_root(start))

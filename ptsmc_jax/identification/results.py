@@ -36,11 +36,11 @@ def identified_scenario(identification: Identification) -> Scenario:
 
 def _write_estimate(
     tables: dict[str, Any],
-    dispersion: dict[str, Any],
+    dispersion: dict[str, object],
     name: str,
     values: np.ndarray,
     std: np.ndarray,
-    identification: Any,
+    identification: Identification,
 ) -> None:
     """Write the estimate of one parameter into the tables, and its uncertainty into [dispersion]."""
     hardware = dict(tables.get("hardware", {}))
@@ -79,13 +79,18 @@ def _write_estimate(
         tables["hardware"] = hardware
 
 
-def _relative_dispersion(std: np.ndarray, values: np.ndarray) -> dict[str, Any]:
+def _relative_dispersion(std: np.ndarray, values: np.ndarray) -> dict[str, object]:
     largest = min(np.max(std / np.abs(values), initial=0.0), MAX_STD)
     return {"kind": "relative_normal", "std": float(largest)}
 
 
 def _write_disturbance(
-    tables: dict[str, Any], dispersion: dict[str, Any], name: str, numbers: list[float], std: np.ndarray, relative: Any
+    tables: dict[str, Any],
+    dispersion: dict[str, object],
+    name: str,
+    numbers: list[float],
+    std: np.ndarray,
+    relative: dict[str, object],
 ) -> None:
     """Write the estimate of a disturbance into the terms of its table; a bias becomes an additional term."""
     table = dict(tables.get("disturbance", {}))
@@ -146,7 +151,7 @@ def summary(identification: Identification) -> dict[str, Any]:
     }
 
 
-def _summarise_fit(fit: Fit) -> dict[str, Any]:
+def _summarise_fit(fit: Fit) -> dict[str, object]:
     names = component_names(fit)
     rms = np.sqrt(np.nanmean(np.where(fit.innovations.accepted, fit.innovations.value, np.nan) ** 2, axis=0))
     largest = np.max(np.abs(fit.autocorrelation()), axis=0)

@@ -17,6 +17,7 @@ from ptsmc_jax.campaigns import run_tables
 from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.scenario.identify_tables import StateTelemetry, Telemetry
 from ptsmc_jax.scenario.parsing import nearest_name_hint
+from ptsmc_jax.scenario.spacecraft_scenario import SpacecraftScenario
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.signals import references
 from ptsmc_jax.simulation.catalogues import UNITS
@@ -173,9 +174,9 @@ def _read_state_log(scenario: Scenario, table: _Table) -> Measurements:
     return Measurements(table.name, t[start:] - t[start], {"x": x[start:]}, command[start:])
 
 
-def _read_spacecraft_log(scenario: Scenario, table: _Table) -> Measurements:
+def _read_spacecraft_log(scenario: Any, table: _Table) -> Measurements:
     """Return the log of a spacecraft, starting at the first row with an attitude."""
-    config: Any = scenario.telemetry or Telemetry()
+    config: Telemetry = scenario.telemetry or Telemetry()
     t, readings = table.read_times(config.time), {}
     logged = set(table.frame.columns)
     columns = config.attitude or _numbered_columns("measured_q", 4)
@@ -226,7 +227,7 @@ def _find_start_row(t: Values, readings: dict[str, Values], is_complete: Values)
     return int(np.argmax(is_usable)) if is_usable.any() else int(np.argmax(is_complete))
 
 
-def _read_attitudes(config: Any, table: _Table, columns: Sequence[str]) -> Values:
+def _read_attitudes(config: Telemetry, table: _Table, columns: Sequence[str]) -> Values:
     """Return unit quaternions (rows, 4), scalar last, from body to inertial axes, with a continuous sign."""
     q = table.read_vectors(columns)
     norm = np.linalg.norm(q, axis=1)
@@ -243,7 +244,9 @@ def _read_attitudes(config: Any, table: _Table, columns: Sequence[str]) -> Value
     return q
 
 
-def _read_torques_or_speeds(scenario: Any, config: Any, table: _Table, t: Values) -> tuple[Values, bool]:
+def _read_torques_or_speeds(
+    scenario: SpacecraftScenario, config: Telemetry, table: _Table, t: Values
+) -> tuple[Values, bool]:
     """Return the commands (rows, channels), and `by_channel` of `Measurements`."""
     key = "wheel_torque" if config.wheel_torque is not None else "wheel_speed"
     columns, torque_unit = getattr(config, key), UNITS["N m"][config.torque_unit]
