@@ -1,7 +1,7 @@
 """Figures of an identification: measured and predicted signals, innovations, their autocorrelation, estimates."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -11,6 +11,9 @@ from ptsmc_jax.figures import style
 from ptsmc_jax.formulas import ARCSEC
 from ptsmc_jax.identification import results
 from ptsmc_jax.identification.estimation import Fit, Identification
+
+if TYPE_CHECKING:
+    from polars import DataFrame
 
 POINTS = 4000  # largest number of points of a line
 UNITS = {"attitude": ("arcsec", ARCSEC), "rate": ("rad/s", 1.0)}  # drawn units of innovations, and their factors
@@ -54,7 +57,7 @@ def _predictions(fit: Fit, values: np.ndarray) -> list[tuple[str, np.ndarray, np
     return panels
 
 
-def _panels(labels: Sequence[str], title: str, xlabel: str = style.TIME) -> tuple[Figure, Any]:
+def _panels(labels: Sequence[str], title: str, xlabel: str = style.TIME) -> tuple[Figure, np.ndarray]:
     """Return a figure with a plot for each label, and the plots."""
     figure = Figure(figsize=(8.0, 1.0 + 1.5 * len(labels)), layout="constrained")
     axes = np.ravel(figure.subplots(len(labels), 1, sharex=True))
@@ -130,7 +133,7 @@ def autocorrelation(names: list[str], values: np.ndarray, counts: np.ndarray) ->
 
 
 @style.styled
-def estimates(table: Any) -> Figure:
+def estimates(table: "DataFrame") -> Figure:
     """Draw the change of each number, relative to the largest number of its parameter, with its 95 % interval.
 
     The prior interval is drawn beside it in grey. `table` is that of `Identification.table`.

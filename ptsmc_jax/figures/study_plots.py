@@ -8,6 +8,7 @@ import matplotlib.colors
 import matplotlib.lines
 import matplotlib.ticker
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
@@ -307,7 +308,7 @@ def costs(
     return figure
 
 
-def _draw_colour_map(axes: Any, x: MapAxis, y: MapAxis, grid: np.ndarray, same_scale: Sequence[np.ndarray]) -> None:
+def _draw_colour_map(axes: Axes, x: MapAxis, y: MapAxis, grid: np.ndarray, same_scale: Sequence[np.ndarray]) -> None:
     """Draw a grid (y, x) as colours; same_scale: all grids with this scale."""
     known = np.concatenate([map_axis.ravel() for map_axis in same_scale])
     known = known[np.isfinite(known) & (known > 0)]

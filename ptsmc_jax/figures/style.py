@@ -1,7 +1,7 @@
 """The common style of all figures, and their files."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -51,7 +51,7 @@ def with_unit(name: str, unit: str) -> str:
 class _DecadeLocator(matplotlib.ticker.LogLocator):
     """Ticks of a log axis at 1, 2 and 5 times powers of ten; at powers only if numbers would overlap or be too many."""
 
-    def tick_values(self, vmin: float, vmax: float) -> Any:
+    def tick_values(self, vmin: float, vmax: float) -> Sequence[float]:
         """Return the ticks of an axis from vmin to vmax."""
         vmin, vmax = sorted((vmin, vmax))  # the axis may be inverted
         room = WIDE_RATIO if self.axis is None else 10.0 ** (self.axis.get_tick_space() / self._space(vmin, vmax))
