@@ -8,7 +8,7 @@ import tempfile
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import polars as pl
 
@@ -38,6 +38,9 @@ from tuning.studies.campaign_folder import Folder
 from tuning.studies.front import KINDS, Front, Point
 from tuning.studies.reproduction import Reproduction
 from tuning.studies.tuner import Tuning
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 class Outcome:
@@ -112,7 +115,7 @@ class Tuned(Outcome):
         """The report of `ptsmc tune`."""
         return reports.build("tune", self.summary, self.original.plant.kind)
 
-    def _figures(self) -> dict[str, Any]:
+    def _figures(self) -> dict[str, "Figure"]:
         return tune_files.figures_of(self.original, self.tuning)
 
 
@@ -149,7 +152,7 @@ class Traced(Outcome):
         """The report of `ptsmc pareto`."""
         return front_report.build(self.front)
 
-    def _figures(self) -> dict[str, Any]:
+    def _figures(self) -> dict[str, "Figure"]:
         return {KINDS[self.front.against].file: fronts.figure_of(self.trade, self.front)}
 
 
@@ -196,7 +199,7 @@ class Margins(Outcome):
         """The report of `ptsmc margins`."""
         return reports.build("margins", stability.summary(self.ready, self.course), self.ready.scenario.plant.kind)
 
-    def _figures(self) -> dict[str, Any]:
+    def _figures(self) -> dict[str, "Figure"]:
         return stability.figures_of(self.ready, self.course)
 
 
@@ -247,7 +250,7 @@ class Campaign(Outcome):
         """
         return campaign_summary.worst_trials(self.folder, by, count)
 
-    def _figures(self) -> dict[str, Any]:
+    def _figures(self) -> dict[str, "Figure"]:
         return campaign_figures.build(self.folder, self.summary)
 
 
@@ -300,7 +303,7 @@ class Reproduced(Outcome):
         """The report of `ptsmc reproduce`."""
         return reports.build("reproduce", reproduction.summary(self.reproduction), "spacecraft")
 
-    def _figures(self) -> dict[str, Any]:
+    def _figures(self) -> dict[str, "Figure"]:
         return reproduction.figures_of(self.reproduction)
 
 

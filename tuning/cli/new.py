@@ -160,7 +160,7 @@ class _ScenarioFile:
             yield from self.kind_lines("sensors", kind, SENSORS[kind], None, {})
 
     def kind_lines(
-        self, name: str, kind: str | None, struct: type[Table], stated: dict[str, Any] | None, values: dict[str, Any]
+        self, name: str, kind: str | None, struct: type[Table], stated: dict[str, Any] | None, values: dict[str, object]
     ) -> Iterator[str]:
         """Return the lines of the keys of one kind of a table.
 
@@ -186,7 +186,7 @@ class _ScenarioFile:
                 yield from _key_lines(is_off, key.name, value, _describe_key(key))
 
     def custom_lines(
-        self, struct: type[Table], stated: Mapping[str, Any] | None, values: Mapping[str, Any]
+        self, struct: type[Table], stated: Mapping[str, object] | None, values: Mapping[str, object]
     ) -> Iterator[str]:
         """Return the lines of the fields of a custom class."""
         if issubclass(struct, Custom):
@@ -194,7 +194,9 @@ class _ScenarioFile:
                 if key not in ("kind", *struct.__struct_fields__):
                     yield from _key_lines(False, key, values[key], "custom")
 
-    def inline_lines(self, name: str, key: keys.Key, chosen: Mapping[str, Any], kinds: layouts.Kinds) -> Iterator[str]:
+    def inline_lines(
+        self, name: str, key: keys.Key, chosen: Mapping[str, object], kinds: layouts.Kinds
+    ) -> Iterator[str]:
         """Return a line for each kind of an inline table; all but the kind in the scenario are comments.
 
         Args:
@@ -228,7 +230,7 @@ class _ScenarioFile:
             entry = known[name]
             yield from _key_lines(stated is None, name, limit, f"{entry.meaning} [{entry.unit}]")
 
-    def default_values(self, name: str, struct: type[Table]) -> dict[str, Any]:
+    def default_values(self, name: str, struct: type[Table]) -> dict[str, object]:
         """Return the defaults of the keys of a table; keys without a default are missing."""
         needed = {"code": EXAMPLES[f"{name}.code"]} if issubclass(struct, Custom) else {}
         needed |= {"t_f": self.resolved.controller.t_f} if issubclass(struct, LawTable) else {}
@@ -238,7 +240,7 @@ class _ScenarioFile:
         table = table.complete_for_file(self.resolved) if isinstance(table, PartTable) else table
         return {key: value for key, value in parsing.to_dict(table).items() if value not in ([], {})}
 
-    def example_value(self, table: str, kind: str | None, key: keys.Key) -> Any:
+    def example_value(self, table: str, kind: str | None, key: keys.Key) -> object:
         """Return the value that a comment shows for an unused key: its default or an example."""
         if key.default not in (None, (), msgspec.NODEFAULT):
             return key.default
@@ -252,7 +254,7 @@ class _ScenarioFile:
         return [value] * (4 if kind == "pyramid" else 3) if key.allowed.endswith("for each wheel") else value
 
 
-def scenario_text(plant: str | None, raw: Mapping[str, Any]) -> str:
+def scenario_text(plant: str | None, raw: Mapping[str, object]) -> str:
     """Return a commented scenario file.
 
     Args:
@@ -281,7 +283,7 @@ def _describe_key(key: keys.Key) -> str:
     return choice + key.text
 
 
-def _key_lines(off: bool, key: str, value: Any, meaning: str) -> Iterator[str]:
+def _key_lines(off: bool, key: str, value: object, meaning: str) -> Iterator[str]:
     """Return `key = value  # meaning`; a long meaning is on the lines above."""
     shown = f"{'#' if off else ''}{errors.show_key(key)} = {errors.show(value)}"
     line = f"{shown:<{COLUMN - 1}} # {meaning}"

@@ -27,7 +27,7 @@ class LongSearch:
     objective: str  # name of the objective in the progress
     work: Callable[[Progress, "Journal"], Any]  # runs the search; its result has a `status`
     write: Callable[[Path, Any], None]  # writes the result into a result folder
-    check: Callable[[], Any] = lambda: None  # raises configuration errors that the scenario does not have
+    check: Callable[[], object] = lambda: None  # raises configuration errors that the scenario does not have
 
 
 def warn_about_seed(scenario: Path, seed: int) -> None:

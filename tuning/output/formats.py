@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
 
 
 def format_number(value: float | None, format_spec: str, none: str = "-") -> str:
@@ -197,7 +196,7 @@ def failed_counts(counts: Mapping[str, int]) -> dict[str, int]:
     return {status: count for status, count in counts.items() if count and status != "ok"}
 
 
-def parse_cell(cell: str) -> Any:
+def parse_cell(cell: str) -> float | str:
     """Return the number in a cell of a CSV file, NaN for an empty cell, or its text."""
     try:
         return float(cell or "nan")

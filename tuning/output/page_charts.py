@@ -25,7 +25,7 @@ PANELS = {
 }  # fmt: skip
 
 
-def _layout(**others: Any) -> Chart:
+def _layout(**others: object) -> Chart:
     return {
         "template": {"layout": {"font": {"family": "system-ui, sans-serif", "size": 13}, "colorway": COLOURS}},
         "margin": {"l": 70, "r": 50, "t": 40, "b": 50},
@@ -76,7 +76,7 @@ def history(columns: Mapping[str, np.ndarray], spacecraft: bool, marks: Mapping[
     return {"data": data, "layout": _layout(**axes, xaxis=time, shapes=shapes, annotations=annotations)}
 
 
-def _vertical_line(x: float, **line: Any) -> Chart:
+def _vertical_line(x: float, **line: object) -> Chart:
     """Return a vertical line over the whole height of a chart; line: its style."""
     return {"type": "line", "x0": x, "x1": x, "yref": "paper", "y0": 0, "y1": 1, "line": line}
 

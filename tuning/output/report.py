@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from tuning.output.formats import format_error, format_ratio, ratio_to_bound
 
@@ -46,7 +46,7 @@ class Chart:
     """A chart of the page, as Plotly's JSON."""
 
     name: str
-    figure: dict[str, Any]
+    figure: dict[str, object]
     caption: str
     shape: str = ""
 

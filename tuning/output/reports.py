@@ -31,7 +31,7 @@ MAP_NOTE = (
 )
 
 
-def build(command: str, summary: Mapping[str, Any], plant: str) -> Report:
+def build(command: str, summary: Mapping[str, object], plant: str) -> Report:
     """Return the report of a result.
 
     Args:

@@ -219,7 +219,7 @@ class Margins(msgspec.Struct, frozen=True, kw_only=True):
     limit_cycle: Row | None = None  # of `limit_cycles.LimitCycle`, with the unit of its size
 
 
-def read(kind: type[T], summary: Mapping[str, Any]) -> T:
+def read(kind: type[T], summary: Mapping[str, object]) -> T:
     """Return a summary as this class. Raises msgspec.ValidationError if a field is missing or has another type."""
     return msgspec.convert(store.to_json_value(summary), kind)
 
@@ -241,7 +241,7 @@ def tune(summary: Mapping[str, Any]) -> Tune:
     return read(Tune, {**summary, **groups})
 
 
-def _collect_metrics(entries: Mapping[str, Any]) -> dict[str, Any]:
+def _collect_metrics(entries: Mapping[str, object]) -> dict[str, object]:
     """Return the entries with all metrics in one table."""
     known = {**CATALOGUE, **CATALOGUES["chain"], **MARGINS}
     return {**entries, "metrics": {name: value for name, value in entries.items() if name in known}}

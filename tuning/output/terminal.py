@@ -11,7 +11,9 @@ WIDE = 1000  # assumed number of columns of a file or a pipe
 UNBROKEN_WIDTH = 24  # largest number of columns of a cell that is never broken
 
 
-def print_result(command: str, summary: Mapping[str, Any], plant: str, folder: Path, *, earlier: bool = False) -> None:
+def print_result(
+    command: str, summary: Mapping[str, object], plant: str, folder: Path, *, earlier: bool = False
+) -> None:
     """Print the report of a result without its charts and pictures.
 
     Args:
@@ -68,7 +70,7 @@ def _smallest_width(cell: str) -> int:
     return len(cell) if len(cell) <= UNBROKEN_WIDTH else max(map(len, cell.split()))
 
 
-def _print(content: Any, width: int | None = None, **options: Any) -> None:
+def _print(content: object, width: int | None = None, **options: Any) -> None:
     """Print; a reader that closes the pipe, such as `head`, changes neither the work nor the exit status."""
     from rich.console import Console
 

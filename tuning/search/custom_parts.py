@@ -65,7 +65,7 @@ def allow_scenario(path: Path, scenario: Scenario, trusted: bool) -> None:
         allow_results(programs, path, store.read_versions(folder), trusted)
 
 
-def allow_results(programs: Mapping[str, str], results: Path, versions: Mapping[str, Any], trusted: bool) -> None:
+def allow_results(programs: Mapping[str, str], results: Path, versions: Mapping[str, object], trusted: bool) -> None:
     """Report the custom code that results name, and check that it may run.
 
     Args:
@@ -89,7 +89,7 @@ def allow_results(programs: Mapping[str, str], results: Path, versions: Mapping[
         print(f"ptsmc: {results} has no checksum of {file}, which may have changed since", file=sys.stderr)
 
 
-def check_unchanged(programs: Mapping[str, str], results: Path, versions: Mapping[str, Any]) -> list[str]:
+def check_unchanged(programs: Mapping[str, str], results: Path, versions: Mapping[str, object]) -> list[str]:
     """Check that custom code has the checksums that results contain.
 
     Args:
@@ -117,7 +117,7 @@ def check_unchanged(programs: Mapping[str, str], results: Path, versions: Mappin
     return unknown
 
 
-def _known_checksums(versions: Mapping[str, Any], key: str) -> list[str]:
+def _known_checksums(versions: Mapping[str, object], key: str) -> list[str]:
     """Return the known checksums of custom code. A comparison has one for each of its laws, under the same key."""
     laws = versions.get("custom_laws") if key == "controller.code" else None
     checksums = (versions.get(custom.checksum_name(key)), *(laws.values() if isinstance(laws, dict) else ()))

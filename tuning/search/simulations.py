@@ -18,6 +18,7 @@ from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.campaigns.montecarlo import Simulated, Trials
 from ptsmc_jax.dispersions.base import INERTIA, Coordinates
 from ptsmc_jax.dispersions.variation import Dispersion
+from ptsmc_jax.numerics.draws import WholeNumber
 from ptsmc_jax.simulation.catalogues import POINTING
 from ptsmc_jax.simulation.metrics import Metrics
 from ptsmc_jax.simulation.rollout import Parts
@@ -32,7 +33,7 @@ class Batch(NamedTuple):
 
     parts: Parts
     dispersion: Dispersion
-    seed: Any
+    seed: WholeNumber
     names: tuple[str, ...]  # names of the gains
     trials: np.ndarray  # (trials,) numbers that select the noise
     coordinates: Mapping[str, np.ndarray]  # random numbers of the dispersions, trials on the first axis

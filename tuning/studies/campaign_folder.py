@@ -84,7 +84,7 @@ class Folder:
         return self.custom_code | custom.data_files_by_key(self.scenario)
 
     @cached_property
-    def identity(self) -> dict[str, Any]:
+    def identity(self) -> dict[str, object]:
         """The entries of `versions.json` that identify the campaign.
 
         The checksums are those in the folder if it exists, else those of the present files.
@@ -100,7 +100,7 @@ class Folder:
         return {"command": "montecarlo", "seed": self.seed, "precision": self.bits, **metrics, **present}
 
     @property
-    def versions(self) -> dict[str, Any]:
+    def versions(self) -> dict[str, object]:
         """The content of `versions.json`."""
         names = None if self.custom_metrics is None else self.custom_metric_names
         counts = {"trials": self.trials, "first_look": self.first_look}
@@ -298,7 +298,7 @@ def begin(folder: Folder, force: bool) -> None:
     store.write_folder(path, write_files)
 
 
-def _contains_campaign(folder: Folder, tables: Mapping[str, Any]) -> bool:
+def _contains_campaign(folder: Folder, tables: Mapping[str, object]) -> bool:
     """Return whether the folder contains exactly this campaign.
 
     Raises RefusedError if the folder can neither be continued nor extended to this campaign.

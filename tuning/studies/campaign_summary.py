@@ -176,7 +176,7 @@ def summarise(folder: Folder) -> dict[str, Any]:
     }
 
 
-def _count_controller_samples(folder: Folder, parts: list[rows.Part]) -> dict[str, Any]:
+def _count_controller_samples(folder: Folder, parts: list[rows.Part]) -> dict[str, object]:
     """Return the numbers of samples and of trials for each status of the C code; empty without C code."""
     if folder.controller is None:
         return {}
@@ -218,7 +218,7 @@ def _equal_trials(quantiles: dict[str, Any], trials: int) -> list[str]:
     return [f"all {trials} trials have the same metrics: {reason}; one trial is enough"]
 
 
-def _pointing_budget(folder: Folder, parts: list[rows.Part], finished: np.ndarray) -> dict[str, Any]:
+def _pointing_budget(folder: Folder, parts: list[rows.Part], finished: np.ndarray) -> dict[str, object]:
     """Return the pointing budget: an upper bound for every pointing error index and axis [rad].
 
     At least the fraction `BUDGET_FRACTION` of all possible runs stays below the bound, with the confidence
@@ -325,7 +325,7 @@ def most_extreme(metric: str, values: np.ndarray, failed: np.ndarray, count: int
     return statistics.most_extreme(values, failed, count, larger_is_better=larger_is_better)
 
 
-def explain_worst_trials(folder: Folder, metrics: Sequence[str], count: int) -> list[dict[str, Any]]:
+def explain_worst_trials(folder: Folder, metrics: Sequence[str], count: int) -> list[dict[str, object]]:
     """Return the inputs of the worst trials by each metric, compared with the inputs of all trials.
 
     Failed trials come first, as in `worst_trials`. If several inputs order the trials equally, only the first of them
@@ -350,7 +350,7 @@ def explain_worst_trials(folder: Folder, metrics: Sequence[str], count: int) -> 
     distinct = statistics.distinct_inputs({name: values for name, values in varied.items() if name not in CATEGORIES})
     names = [name for name in varied if name in distinct or name in CATEGORIES]
     failed = ~running.has_finished(frame)
-    entries: list[dict[str, Any]] = []
+    entries: list[dict[str, object]] = []
     for metric in metrics:
         values = frame[metric].fill_null(float("nan")).to_numpy()
         has_value = np.isfinite(values) & ~failed

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from scipy import stats
 
 from ptsmc_jax.campaigns import store
@@ -165,7 +166,7 @@ def _has_law(table: Any, law: Mapping[str, str]) -> bool:
     if table.kind != law["kind"] or table.kind != "custom":
         return table.kind == law["kind"]
 
-    def file_and_class(code: str) -> tuple[Any, str]:
+    def file_and_class(code: str) -> tuple[str, str]:
         return systems.location(code), code.rpartition(":")[2]
 
     return isinstance(table.code, str) and file_and_class(table.code) == file_and_class(law["code"])
@@ -186,7 +187,7 @@ def validated_contenders(scenario: Scenario, rivals: Rivals = Rivals()) -> dict[
     return candidates
 
 
-def _with_default_search(other: Scenario, tune: tables.Tune, shared: dict[str, Any]) -> Scenario:
+def _with_default_search(other: Scenario, tune: tables.Tune, shared: dict[str, object]) -> Scenario:
     """Return the scenario with the default free gains of its law, and with the same bounds of t_f if t_f is minimised.
 
     Args:
@@ -208,7 +209,7 @@ def perturbed_scenarios(simulated: Scenario) -> dict[str, Scenario]:
     """
     assert isinstance(simulated, SpacecraftScenario)
     inertia = np.asarray(simulated.true_inertia)
-    changes: list[dict[str, Any]] = [
+    changes: list[dict[str, object]] = [
         {"spacecraft__true_inertia": ((1.0 + INERTIA_ERROR) * inertia).tolist()},
         {"spacecraft__true_inertia": ((1.0 - INERTIA_ERROR) * inertia).tolist()},
         {"hardware__delay": simulated.devices.delay_periods + 1},
@@ -274,7 +275,7 @@ def compare(
     return Comparison(results, held_out_seed, interrupted, published_error)
 
 
-def contender_results(contender: Contender) -> dict[str, Any]:
+def contender_results(contender: Contender) -> dict[str, object]:
     """Return the results of a contender as in `summary.json`.
 
     Statistics use the trials that reached their end. The counts and the quantiles of the settling time use all trials.
@@ -311,7 +312,7 @@ def contender_results(contender: Contender) -> dict[str, Any]:
     }
 
 
-def _perturbed_results(trials: Trials) -> dict[str, Any]:
+def _perturbed_results(trials: Trials) -> dict[str, object]:
     """Return the results of trials with a model error that the law does not know."""
     error, interval = judging.rms_window_error(trials)
     return {
@@ -362,7 +363,9 @@ def summary(comparison: Comparison) -> dict[str, Any]:
     }
 
 
-def write(folder: Path, scenario: Scenario, comparison: Comparison, figures: bool, identity: Mapping[str, Any]) -> None:
+def write(
+    folder: Path, scenario: Scenario, comparison: Comparison, figures: bool, identity: Mapping[str, object]
+) -> None:
     """Write a result folder: `summary.json`, `compare.csv`, a scenario for each law, and figures.
 
     Args:
@@ -388,7 +391,7 @@ _COLUMNS = ("met", "window_error", "peak_torque", "largest_peak_torque", "effort
             "settling_by_angle")  # fmt: skip
 
 
-def _csv_table(scenario: Scenario, content: Mapping[str, Any]) -> tuple[list[str], list[list[Any]]]:
+def _csv_table(scenario: Scenario, content: Mapping[str, Any]) -> tuple[list[str], list[list[object]]]:
     """Return the header and the rows of `compare.csv`, one row for each law."""
     required = [name for name in catalogues.MARGINS if name in scenario.requirements]
     nominal = [name for name in catalogues.MARGINS if name not in required]  # columns of the nominal loop in hold
@@ -396,7 +399,7 @@ def _csv_table(scenario: Scenario, content: Mapping[str, Any]) -> tuple[list[str
             "window_error_low", "window_error_high", *(f"window_error_{name}" for name in MODEL_ERRORS),
             "gains"]  # fmt: skip
 
-    def row(law: str, figures: Mapping[str, Any]) -> list[Any]:
+    def row(law: str, figures: Mapping[str, Any]) -> list[object]:
         worst = {v["metric"]: v["worst"] for v in figures["verdicts"]}
         hold = (figures["margins"] or {}).get("hold", {})
         return [
@@ -409,7 +412,7 @@ def _csv_table(scenario: Scenario, content: Mapping[str, Any]) -> tuple[list[str
     return header, [row(law, figures) for law, figures in content["laws"].items()]
 
 
-def _plot_figures(comparison: Comparison) -> Iterator[tuple[str, Any]]:
+def _plot_figures(comparison: Comparison) -> Iterator[tuple[str, Figure]]:
     trials_by_law = {law: contender.trials for law, contender in comparison.contenders.items()}
     ours = comparison.contenders[OURS]
     t_f = ours.simulated.controller.t_f
@@ -424,7 +427,7 @@ def _plot_figures(comparison: Comparison) -> Iterator[tuple[str, Any]]:
     )  # fmt: skip
 
 
-def identity(scenario: Scenario, seed: int, against: Rivals = Rivals()) -> dict[str, Any]:
+def identity(scenario: Scenario, seed: int, against: Rivals = Rivals()) -> dict[str, object]:
     """Return the entries of `versions.json` that identify a comparison.
 
     Args:

@@ -115,7 +115,7 @@ class Front:
         """Return the points of `others` by the labels that tables and figures show."""
         return {self.published_label if name == "published" else name: point for name, point in self.others.items()}
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, object]:
         """Return the content of `summary.json`."""
         return {"status": self.status, **asdict(self)}
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import polars as pl
@@ -16,7 +15,7 @@ from ptsmc_jax.scenario.tables import Scenario
 from tuning.search import custom_parts
 
 
-def write(folder: Path, identification: Identification, figures: bool, made_by: Mapping[str, Any]) -> None:
+def write(folder: Path, identification: Identification, figures: bool, made_by: Mapping[str, object]) -> None:
     """Write a result folder: `identified.toml`, `summary.json`, `innovations.csv` and figures.
 
     Args:
@@ -41,13 +40,15 @@ def write(folder: Path, identification: Identification, figures: bool, made_by: 
         style.save(identification_plots.identification_figures(identification), folder / "figures")
 
 
-def design_summary(design: Design, settings: Mapping[str, Any]) -> dict[str, Any]:
+def design_summary(design: Design, settings: Mapping[str, object]) -> dict[str, object]:
     """Return the content of `summary.json` of a design; settings: duration [s] and limits of the manoeuvre."""
     rows = list(design.table().iter_rows(named=True))
     return {"status": "designed", **settings, "parameters": rows, "undetermined": design.undetermined}
 
 
-def write_design(folder: Path, scenario: Scenario, design: Design, figures: bool, settings: Mapping[str, Any]) -> None:
+def write_design(
+    folder: Path, scenario: Scenario, design: Design, figures: bool, settings: Mapping[str, object]
+) -> None:
     """Write a result folder: `profile.csv`, `summary.json` and a figure of the profile.
 
     Args:

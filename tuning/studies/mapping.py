@@ -201,12 +201,12 @@ def _with_keys(scenario: Scenario, values: dict[str, float]) -> Scenario:
     Raises:
         ScenarioError: the scenario is not valid, the key has rows of numbers, or all moments of inertia would be equal.
     """
-    changes: dict[str, Any] = {}
+    changes: dict[str, object] = {}
     for key, value in values.items():
         table, _, name = key.partition(".")
         name, _, index = name.partition("[")
         current = changes.get(f"{table}__{name}", getattr(getattr(scenario, table, None), name, None))
-        new_value: Any = int(value) if key in WHOLE_NUMBERS else value
+        new_value: object = int(value) if key in WHOLE_NUMBERS else value
         number = index.removesuffix("]")
         if number and int(number) >= (len(current) if isinstance(current, tuple | list) else 0):
             shown = "absent" if current is None else errors.brief(current)

@@ -3,10 +3,9 @@
 A trade states the tuning problems, see `trades`. Each problem starts from the best gains of the others.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -184,7 +183,7 @@ def find_knee(points: np.ndarray) -> int:
     return int(np.argmax(log_offsets[:, 0] * chord[1] - log_offsets[:, 1] * chord[0]))
 
 
-def write(folder: Path, trade: Trade, front: Front, figures: bool, identity: dict[str, Any]) -> None:
+def write(folder: Path, trade: Trade, front: Front, figures: bool, identity: Mapping[str, object]) -> None:
     """Write a result folder: `summary.json`, a CSV file with the points, and a figure.
 
     Args:

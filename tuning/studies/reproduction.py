@@ -5,7 +5,6 @@ Read `reproduce` first, then `write`.
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -39,7 +38,7 @@ def reproduce() -> Reproduction:
     return Reproduction(cases, claims.claims(cases), slips.slips(cases), claims.measure_observers())
 
 
-def summary(reproduction: Reproduction) -> dict[str, Any]:
+def summary(reproduction: Reproduction) -> dict[str, object]:
     """Return the content of `summary.json`."""
     verdicts = [claim.verdict for claim in reproduction.claims]
     return {

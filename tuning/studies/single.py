@@ -6,7 +6,7 @@ Read `write` first.
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:  # runs without C code do not need this import
 TIME_FRACTION_FIELDS = ("quantile", "confidence", "interpretation", "fraction_of_time", "shown")
 
 
-def summary(run: Run, scenario: Scenario, computer: "InTheLoop | None" = None) -> dict[str, Any]:
+def summary(run: Run, scenario: Scenario, computer: "InTheLoop | None" = None) -> dict[str, object]:
     """Return the content of `summary.json`.
 
     Args:
@@ -58,7 +58,7 @@ def write(
     trial: int | None,
     figures: bool,
     computer: "InTheLoop | None" = None,
-    replayed: Mapping[str, Any] = MappingProxyType({}),
+    replayed: Mapping[str, object] = MappingProxyType({}),
     aem: bool = False,
 ) -> None:
     """Write a result folder: `summary.json`, `trajectory.csv` and figures.

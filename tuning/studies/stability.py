@@ -5,7 +5,7 @@ The loop is linearised along the nominal run: at samples of the approach phase a
 """
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,9 @@ from ptsmc_jax.theory.crossings import LARGEST_MARGIN
 from ptsmc_jax.theory.limit_cycles import LimitCycle
 from ptsmc_jax.theory.margins import FIELDS
 from ptsmc_jax.theory.run_margins import Course
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def find_margins(scenario: Scenario) -> tuple[Study, Course]:
@@ -80,7 +83,7 @@ def _limit_cycle_entry(scenario: Scenario, limit_cycle: LimitCycle) -> dict[str,
     return {"limit_cycle": {**limit_cycle._asdict(), "unit": unit}}
 
 
-def _finite_or_none(value: Any) -> float | None:
+def _finite_or_none(value: float) -> float | None:
     return float(value) + 0.0 if np.isfinite(value) else None  # + 0.0 replaces -0 by 0
 
 
@@ -95,7 +98,9 @@ def summary(ready: Study, course: Course) -> dict[str, Any]:
     inputs, signals = signal_names(ready)
     (_, hold), before = course.hold, course.before_hand_over
 
-    def table(loop_margins: margins.Margins, labels: list[str], fields: tuple[str, ...]) -> dict[str, Any]:
+    def table(
+        loop_margins: margins.Margins, labels: list[str], fields: tuple[str, ...]
+    ) -> dict[str, dict[str, float | None]]:
         return {
             label: {name: _finite_or_none(getattr(loop_margins, name)[k]) for name in fields}
             for k, label in enumerate(labels)
@@ -185,7 +190,7 @@ def write(folder: Path, ready: Study, course: Course, figures: bool) -> None:
         style.save(figures_of(ready, course), folder / "figures")
 
 
-def figures_of(ready: Study, course: Course) -> dict[str, Any]:
+def figures_of(ready: Study, course: Course) -> dict[str, "Figure"]:
     """Return the figures of the margins by name."""
     from ptsmc_jax.figures import margin_plots  # slow import, not needed without figures
 

@@ -105,10 +105,10 @@ class Trade(ABC):
         """
 
     @abstractmethod
-    def options(self) -> dict[str, Any]:
+    def options(self) -> dict[str, object]:
         """Return the options of `ptsmc pareto` that select these values."""
 
-    def identity(self, seed: int) -> dict[str, Any]:
+    def identity(self, seed: int) -> dict[str, object]:
         """Return the entries of `versions.json` that identify a finished or interrupted front."""
         return {"command": "pareto", "seed": seed, **self.options(), **custom.checksums(self.scenario)}
 
@@ -177,7 +177,7 @@ class Torque(Trade):
         mean = float(np.mean(peaks)) if peaks.size else np.nan
         return {TORQUE: judging.required_quantile(TORQUE, tuned, trials), "mean_peak_torque": mean}
 
-    def options(self) -> dict[str, Any]:
+    def options(self) -> dict[str, object]:
         """Return the option --points of `ptsmc pareto`, by name."""
         return {"points": self.points}
 
@@ -234,7 +234,7 @@ class Margins(Trade):
         verdicts = margin_verdicts.judge_trials(study(judging.on_flight_clock(with_margins)), seed)
         return {TORQUE: judging.required_quantile(TORQUE, tuned, trials)} | {v.metric: v.worst for v in verdicts}
 
-    def options(self) -> dict[str, Any]:
+    def options(self) -> dict[str, object]:
         """Return the options --against and --limits of `ptsmc pareto`, by name."""
         return {"against": self.against, "limits": _join_values(self.values[1:])}
 
@@ -317,7 +317,7 @@ class SlewTime(Trade):
         has = [name for name, table in needed.items() if table is None or getattr(tuned, table, None) is not None]
         return {name: judging.required_quantile(name, tuned, trials) for name in has}
 
-    def options(self) -> dict[str, Any]:
+    def options(self) -> dict[str, object]:
         """Return the options --against and --times of `ptsmc pareto`, by name."""
         return {"against": self.against, "times": _join_values(self.values)}
 

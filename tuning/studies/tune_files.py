@@ -4,7 +4,7 @@ import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from tuning.search import gains as gain_names
 from tuning.search.local_searches import Step
 from tuning.studies import judging
 from tuning.studies.tuner import BeyondBound, Trust, Tuning
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # statistics with a confidence interval
 INTERVAL_STATISTICS = {
@@ -57,7 +60,7 @@ def statistics(trials: Trials, kind: str) -> dict[str, Any]:
     return results
 
 
-def summary(tuning: Tuning) -> dict[str, Any]:
+def summary(tuning: Tuning) -> dict[str, object]:
     """Return the content of `summary.json`."""
     kind, search = tuning.tuned.plant.kind, tuning.search
     groups = {
@@ -122,7 +125,7 @@ def summary(tuning: Tuning) -> dict[str, Any]:
     }
 
 
-def _accuracy_gain(held_out: Mapping[str, Trials]) -> dict[str, Any]:
+def _accuracy_gain(held_out: Mapping[str, Trials]) -> dict[str, object]:
     """Return the ratio of the published gains' RMS window error to the tuned gains' error, and its interval.
 
     The ratio is over the trials that reach their end with both sets of gains.
@@ -137,7 +140,7 @@ def _accuracy_gain(held_out: Mapping[str, Trials]) -> dict[str, Any]:
     }
 
 
-def _trust_entry(trust_results: Trust, tuning: Tuning) -> dict[str, Any]:
+def _trust_entry(trust_results: Trust, tuning: Tuning) -> dict[str, object]:
     """Return the entry "trust" of `summary.json`: gradient check, influence of each gain, sensitivities and margins."""
     is_ideal = not tuning.tuned.sampled and tuning.tuned.hardware is None
     influence = {}
@@ -181,7 +184,7 @@ def _influence_beyond(beyond: BeyondBound | None, bound: float) -> str:
     return f"no better beyond its bound: {error} at {beyond.value:g}"
 
 
-def write(folder: Path, scenario: Scenario, tuning: Tuning, figures: bool, identity: Mapping[str, Any]) -> None:
+def write(folder: Path, scenario: Scenario, tuning: Tuning, figures: bool, identity: Mapping[str, object]) -> None:
     """Write a result folder: `summary.json`, `tuned.toml`, `history.csv` and figures.
 
     Args:
@@ -223,7 +226,7 @@ def _points_by_start(history: Sequence[Step]) -> list[list[Step]]:
     return [list(path) for _, path in itertools.groupby(history, lambda step: step.start)]
 
 
-def identity(scenario: Scenario, seed: int, *, with_global_check: bool) -> dict[str, Any]:
+def identity(scenario: Scenario, seed: int, *, with_global_check: bool) -> dict[str, object]:
     """Return the entries of `versions.json` that identify a tuning run.
 
     Args:
@@ -239,7 +242,7 @@ def identity(scenario: Scenario, seed: int, *, with_global_check: bool) -> dict[
     }
 
 
-def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
+def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, "Figure"]:
     """Return the figures of a tuning run by name."""
     from ptsmc_jax.figures import study_plots, style  # slow import, not needed before the search ends
 
@@ -249,7 +252,7 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
     paths = _points_by_start(tuning.search.history)
     longest = max(map(len, paths))
 
-    def over_steps(value: Callable[[Step], Any], missing: Any = np.nan) -> np.ndarray:  # result: (steps, starts, ...)
+    def over_steps(value: Callable[[Step], Any], missing: float = np.nan) -> np.ndarray:  # result: (steps, starts, ...)
         padding = np.full_like(np.asarray(value(paths[0][0])), missing)
         return np.stack([[value(path[k]) if k < len(path) else padding for path in paths] for k in range(longest)])
 
@@ -260,7 +263,7 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, Any]:
         to_unit, unit = style.metric_display(minimised, kind)
     objective = f"{objective_name(scenario.search).replace(' window', chr(10) + 'window')} [{unit}]"
     gains = over_steps(lambda step: step.gains)
-    figures: dict[str, Any] = {
+    figures: dict[str, Figure] = {
         "history": study_plots.tuning_history(
             {name: (units[k], gains[:, :, k]) for k, name in enumerate(names)},
             to_unit(over_steps(lambda step: step.value)),
