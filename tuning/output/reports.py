@@ -180,8 +180,8 @@ def _count_failures(pair: Mapping[str, Any]) -> float:
 
 def _map_column(name: str, *cells: str, plant: str) -> tuple[str, ...]:
     """Return a column of map.csv with a readable unit in its heading. Gain margins of a map are factors."""
-    values = [parse_cell(cell) for cell in cells]
-    if any(isinstance(value, str) for value in values):
+    values = [value for cell in cells if not isinstance(value := parse_cell(cell), str)]
+    if len(values) < len(cells):
         return name, *cells
     metric = re.sub("^(linear|largest|hold)_(?=torque|peak|window|delay)", "", name)
     units = catalogues.units(plant)
