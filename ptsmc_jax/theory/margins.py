@@ -31,6 +31,8 @@ STEPS_PER_PERIOD = 16  # Steps per period of the grid search for the delay margi
 GRID_ZEROS = 6  # Number of delays found by the grid search at which Newton's method starts.
 LOOPS_PER_CALL = 2  # Loops in one call of the compiled program: each point of a margin map has two.
 MOST_STARTS = 8  # Largest number of attempts of Newton's method for each estimated delay margin.
+HALVINGS = 12  # Largest number of halvings of a grid interval for figures.
+LARGEST_STEP = 0.1  # Largest step of ln L from one point of a figure to the next; 0.1 is 0.9 dB or 6 deg.
 START_DISTANCE = 0.15  # Increase of the starting delay from one attempt of Newton's method to the next, in periods.
 
 
@@ -414,6 +416,23 @@ def _responses(loop: Loop) -> tuple[Array, Array, Array]:
 
 
 def responses(loop: Loop) -> tuple[np.ndarray, np.ndarray]:
-    """Return frequencies (points,) [rad/s] and L of each axis with the other axes closed (points, m)."""
-    w, _, axis_responses = _responses(loop)
-    return np.asarray(w), np.asarray(axis_responses)
+    """Return frequencies (points,) [rad/s] and L of each axis with the other axes closed (points, m), for figures.
+
+    Grid intervals are halved until L is a smooth curve. L follows from the sensitivity of all axes, S_jj = 1/(1 + L_j).
+    """
+    a, b, c = map(np.asarray, linear.open_at_input(loop))
+    w = np.unique(_responses(loop)[0])
+
+    def evaluate(w: np.ndarray) -> np.ndarray:
+        z = np.exp(1j * w * float(loop.period))[:, None, None]
+        L = -c @ np.linalg.solve(z * np.eye(len(a)) - a, np.broadcast_to(b, (w.size, *b.shape)))
+        return 1.0 / np.diagonal(np.linalg.inv(np.eye(len(c)) + L), axis1=1, axis2=2) - 1.0
+
+    L = evaluate(w)
+    for _ in range(HALVINGS):
+        with np.errstate(divide="ignore", invalid="ignore"):  # L may be 0
+            steps = np.abs(np.log(L[1:] / L[:-1]))
+        middle = ((w[1:] + w[:-1]) / 2.0)[np.any(steps > LARGEST_STEP, axis=1)]
+        order = np.argsort(np.append(w, middle))
+        w, L = np.append(w, middle)[order], np.append(L, evaluate(middle), axis=0)[order]
+    return w, L

@@ -554,6 +554,19 @@ def test_sine_of_a_zero_loop_is_finite_in_single_precision():
         np.testing.assert_array_equal(crossings.sine(jnp.asarray([0.0, 2j, -3.0], jnp.complex64)), [0.0, 1.0, 0.0])
 
 
+def test_responses_of_figures_are_smooth_near_a_resonance():
+    """An earlier version drew the circle of a flexible mode with seven points."""
+    a = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0], [0.0, 0.0, -4.0, -0.004]])
+    b = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 0.1], [0.1, 1.0]])
+    c = np.array([[0.1, 0.5, 0.1, 0.1], [0.0, 0.0, 0.0, 1.0]])
+    w, found = margins.responses(held(a, b, -c, 0.1))
+    assert np.abs(np.log(found[1:] / found[:-1])).max() <= margins.LARGEST_STEP
+    discrete: Any = signal.cont2discrete((a, b, c, np.zeros((2, 2))), 0.1)
+    for k in range(0, w.size, 100):
+        L = discrete[2] @ np.linalg.solve(np.exp(0.1j * w[k]) * np.eye(4) - discrete[0], discrete[1])
+        np.testing.assert_allclose(found[k], crossings.axis_responses(jnp.asarray(L[None]))[0], rtol=1e-6)
+
+
 def test_gain_margin_is_found_at_zero_frequency_for_a_slow_pole():
     """The stability limit of x' = (1 + e) x - c x is the gain e / c. L is 0.8 deg from real at the lowest frequency."""
     e, c = 2.2e-4, 0.033
