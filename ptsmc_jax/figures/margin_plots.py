@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from ptsmc_jax.figures.style import STYLES, plain_ticks, styled
 from ptsmc_jax.theory.margins import Margins
@@ -32,6 +33,7 @@ def nichols(L: np.ndarray, names: Sequence[str]) -> Figure:
     angle = np.rad2deg(np.angle(contour)) % 360.0 - 360.0
     axes.plot(angle, _decibels(contour), color="0.35", lw=1.0, label=f"sensitivity {CONTOUR:g} dB")
     axes.plot(-180.0, 0.0, "+", color="0.0", ms=12, mew=1.6)
+    axes.xaxis.set_major_locator(MaxNLocator(9, steps=[1, 4.5, 9, 10]))  # multiples of 45 or 90 deg
     axes.set(xlabel="phase of L [deg]", ylabel="|L| [dB]", ylim=(-LARGEST_SHOWN, LARGEST_SHOWN))
     axes.set_title("Nominal loop, opened at the plant's input, hold phase", loc="left")
     axes.legend()
@@ -43,42 +45,58 @@ def sensitivity(w: np.ndarray, L: np.ndarray, names: Sequence[str]) -> Figure:
     """Plot |S| = |1 / (1 + L)| and |T| = |L / (1 + L)| over the frequency w [rad/s]; L (points, axes)."""
     figure = Figure(figsize=(8.0, 4.5), layout="constrained")
     axes = figure.subplots()
-    is_shown = w > w[-1] * 1e-4
+    is_shown, largest = w > w[-1] * 1e-4, 0.0
     for k, name in enumerate(names):
         colour, _ = STYLES[k % len(STYLES)]
         for letter, transfer, style in (("S", 1.0 / (1.0 + L[:, k]), "-"), ("T", L[:, k] / (1.0 + L[:, k]), "--")):
             size = _decibels(transfer)
             axes.semilogx(w[is_shown], size[is_shown], color=colour, ls=style, label=f"{letter} {name}")
-    axes.axhline(CONTOUR, color="0.35", lw=1.0, ls=":")
-    axes.set(xlabel="frequency [rad/s]", ylabel="size [dB]", ylim=(-LARGEST_SHOWN, 15.0))
+            largest = max(largest, size[is_shown].max())
+    axes.axhline(CONTOUR, color="0.35", lw=1.0, ls=":", label=f"{CONTOUR:g} dB")
+    axes.set(xlabel="frequency [rad/s]", ylabel="magnitude [dB]", ylim=(-LARGEST_SHOWN, largest + 15.0))
     axes.set_title("Sensitivity S and complementary sensitivity T, nominal loop, hold phase", loc="left")
-    axes.legend(ncols=len(names))
+    axes.legend(ncols=len(names) + 1)
     return figure
 
 
 @styled
-def margins_over_time(time_to_go: np.ndarray, before: Margins, hold: Margins) -> Figure:
-    """Plot the margins of the worst axis against time to go (times,) [s], and of the hold phase as lines."""
+def margins_over_time(time_to_go: np.ndarray, judged: np.ndarray, before: Margins, hold: Margins) -> Figure:
+    """Plot the margins of the worst axis against time to go, and of the hold phase as lines.
+
+    Times before the first judged sample and after the last one are grey.
+
+    Args:
+        time_to_go: times to go (times,) [s], longest first.
+        judged: whether a requirement judges the margins at each time, bool (times,).
+        before: margins at these times (times, axes).
+        hold: margins in the hold phase (axes,).
+    """
     figure = Figure(figsize=(8.0, 6.5), layout="constrained")
     rows = figure.subplots(3, 1, sharex=True)
-    panels = (("gain [dB]", "gain_up", "gain_down"), ("phase [deg]", "phase"), ("delay [s]", "delay"))
-    for axes, (label, *names) in zip(rows, panels, strict=True):
+    panels = (("gain", "dB", "gain_up", "gain_down"), ("phase", "deg", "phase"), ("delay", "s", "delay"))
+    for axes, (label, unit, *names) in zip(rows, panels, strict=True):
         for name, (colour, style) in zip(names, STYLES, strict=False):
             values = np.where(before.stable[:, 0], getattr(before, name).min(axis=1), np.nan)
             axes.semilogx(time_to_go, values, color=colour, ls=style, marker=".", label=name.replace("_", " "))
             worst = float(getattr(hold, name).min())
             if np.isfinite(worst):
-                axes.axhline(worst, color=colour, lw=1.0, ls=":", label=f"hold phase: {worst:.3g}")
+                axes.axhline(worst, color=colour, lw=1.0, ls=":", label=f"hold phase: {worst:.3g} {unit}")
         limited = any(np.isfinite(getattr(margins, name)).any() for margins in (before, hold) for name in names)
         if not limited:
             axes.text(0.5, 0.5, "without a limit", transform=axes.transAxes, ha="center", va="center")
         unstable_times = time_to_go[~before.stable[:, 0]]
         if unstable_times.size:
             axes.plot(unstable_times, np.zeros_like(unstable_times), "x", color="0.3", label="frozen loop unstable")
-        axes.set(ylabel=label, ylim=(0.0, None))
-        axes.legend(fontsize=9, ncols=2)
-    rows[-1].set_xlabel("time to t_f, before the hand-over [s]")
+        axes.set(ylabel=f"{label} [{unit}]", ylim=(0.0, None))
+    if judged.any():
+        near, far = rows[0].get_xlim()
+        for axes in rows:
+            axes.axvspan(far, time_to_go[judged][0], color="0.93", zorder=0, label="not judged")
+            axes.axvspan(time_to_go[judged][-1], near, color="0.93", zorder=0)
+            axes.set_xlim(far, near)
+    for axes in rows:
+        axes.legend(fontsize=9, ncols=2, frameon=True, framealpha=1.0, edgecolor="white")
+    rows[-1].set_xlabel("time to go $t_f - t$ before the hand-over [s]")
     plain_ticks(rows[-1].xaxis)
     rows[0].set_title("Margins of the nominal loop with frozen gains, worst axis", loc="left")
-    rows[0].invert_xaxis()
     return figure

@@ -17,7 +17,8 @@ def margins(times):
 
 def test_the_axis_of_the_time_to_go_has_plain_numbers():
     """The numbers have no powers of ten such as 3 x 10^1."""
-    figure = margin_plots.margins_over_time(np.array([34.0, 25.0, 10.0, 5.0, 3.0]), margins(5), margins(1))
+    time_to_go, judged = np.array([34.0, 25.0, 10.0, 5.0, 3.0]), np.full(5, True)
+    figure = margin_plots.margins_over_time(time_to_go, judged, margins(5), margins(1))
     figure.draw_without_rendering()
     labels = [label.get_text() for label in figure.axes[-1].get_xticklabels(which="both") if label.get_text()]
     assert {"5", "10", "20"} <= set(labels)
@@ -26,11 +27,33 @@ def test_the_axis_of_the_time_to_go_has_plain_numbers():
 
 def test_a_panel_states_that_there_is_no_limit():
     """A saturated loop tolerates any gain and delay. An earlier version left the panel empty."""
-    few, free = np.array([10.0, 5.0]), {name: np.full((2, 3), np.inf) for name in ("gain_up", "gain_down")}
-    figure = margin_plots.margins_over_time(few, margins(2)._replace(**free), margins(1)._replace(**free))
+    few = np.array([10.0, 5.0]), np.full(2, True)
+    free = {name: np.full((2, 3), np.inf) for name in ("gain_up", "gain_down")}
+    figure = margin_plots.margins_over_time(*few, margins(2)._replace(**free), margins(1)._replace(**free))
     assert [[text.get_text() for text in axes.texts] for axes in figure.axes] == [["without a limit"], [], []]
     one = margins(1)._replace(gain_up=np.array([[np.inf, 6.0, np.inf]]))
-    assert not margin_plots.margins_over_time(few, margins(2)._replace(**free), one).axes[0].texts
+    assert not margin_plots.margins_over_time(*few, margins(2)._replace(**free), one).axes[0].texts
+
+
+def test_times_that_are_not_judged_are_grey():
+    """Frozen gains give small margins at the start, which no requirement judges."""
+    time_to_go, judged = np.array([40.0, 20.0, 10.0, 5.0, 2.0, 1.0]), np.array([False, False, True, False, True, False])
+    figure = margin_plots.margins_over_time(time_to_go, judged, margins(6), margins(1))
+    for axes in figure.axes:
+        far, near = axes.get_xlim()
+        grey = [area.get_extents().transformed(axes.transData.inverted()).intervalx for area in axes.patches]
+        np.testing.assert_allclose(np.sort(grey), [[10.0, far], [near, 2.0]])
+        assert far > 40.0
+        assert near < 1.0
+        assert axes.get_legend_handles_labels()[1].count("not judged") == 1
+
+
+def test_a_peak_of_the_sensitivity_is_inside_the_figure():
+    """An earlier version cut the figure at 15 dB."""
+    w = np.geomspace(1e-2, 1.0, 500)
+    L = 0.25 / (1j * w * (1j * w + 0.01))[:, None]  # a phase margin of 1 degree
+    (axes,) = margin_plots.sensitivity(w, L, ["x"]).axes
+    assert axes.get_ylim()[1] > max(np.max(np.asarray(line.get_ydata())) for line in axes.lines) > 20.0
 
 
 def test_a_loop_gain_of_zero_is_drawn_without_a_warning():

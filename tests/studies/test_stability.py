@@ -38,7 +38,7 @@ def test_margins_command_writes_table_figures_and_page(command, tmp_path, plant)
     folder = tmp_path / "out" / "margins-s"
     assert status == 0
     assert "gain up [dB]  gain down [dB]" in out
-    assert out.startswith("The nominal loop is stable: gain ")
+    assert out.startswith("The nominal loop is stable; smallest margins at one input: gain ")
     assert {p.name for p in (folder / "figures").iterdir()} == {"nichols.png", "sensitivity.png", "margins.png"}
     found = json.loads((folder / "summary.json").read_text())
     of_axes(tables(folder / "margins.csv"), found, names, seen)
@@ -70,6 +70,8 @@ def of_axes(rows, found, names, seen):
         assert one["peak_sensitivity"] == max(float(row["peak_sensitivity_dB"]) for row in axes)
         assert one["phase"] == min(float(row["phase_deg"]) for row in axes)
         assert one["delay"] == min(float(row["delay_s"]) for row in axes)
+        assert {row["judged"] for row in axes} == {str(int(one["judged"]))}
+    assert all(row["judged"] == "1" for row in hold)
     judged = [one["phase"] for one in found["before"] if one["judged"]]
     in_hold = [one["phase"] for one in found["hold"].values()]
     np.testing.assert_allclose(found["worst"]["phase_margin"], min([*in_hold, *judged]))
@@ -228,7 +230,7 @@ def test_saturated_command_is_reported_as_an_open_loop():
     held, before = (line for line in report.lines if "limit of the actuators" in line)
     assert held.startswith("the loop is open at input u1 in the hold phase: a limit of the actuators cuts")
     assert before.startswith("the loop is open at input u1 in the approach phase, at ")
-    assert not any("smallest margins" in line for line in report.lines)
+    assert not any("judged" in line for line in report.lines)
     assert found["not_converged"]  # with this limit, the state 1 decreases to 0.91 in 3 s at best
     assert any(line.startswith("the nominal run has not converged at t_f") for line in report.lines)
     assert report.headline == "The nominal loop is open in the hold phase"
@@ -237,8 +239,10 @@ def test_saturated_command_is_reported_as_an_open_loop():
     assert "not_converged" not in found
     lines = reported(found).lines
     assert not any(word in line for line in lines for word in ("dispersed", "misses", "limit of the actuators"))
+    (judged,) = [one["time_to_go"] for one in found["before"] if one["judged"]]
+    assert lines[0].endswith(f"at {judged:.3g} s to go")
     # margins at all inputs together and at the sensors may be smaller; the table has them
-    assert any(line.startswith("these are the smallest margins at any input") for line in lines)
+    assert lines[1].startswith("margins at all inputs together and at the sensors are not judged")
     # margins of an axis if another axis makes the loop unstable
     least = np.full_like(course.at_input.peak_sensitivity, -100.0)
     lost = {"gain_up": least, "gain_down": least, "peak_sensitivity": np.copysign(0.0, least), "stable": least > 0.0}

@@ -26,13 +26,16 @@ def build(summary: Margins) -> Report:
     elif not summary.stable:
         headline, mood = "The nominal loop is NOT stable in the hold phase", "bad"
     elif unstable:
-        worst = format_margins(summary.worst)
-        headline, mood = f"Stable in the hold phase, NOT stable in the approach phase: {worst}", "bad"
+        headline, mood = f"Stable in the hold phase, NOT stable in the approach phase; {_format_worst(summary)}", "bad"
     else:
-        headline, mood = f"The nominal loop is stable: {format_margins(summary.worst)}", "calm"
+        headline, mood = f"The nominal loop is stable; {_format_worst(summary)}", "calm"
     return Report(
         headline, mood, list(_condition_lines(summary)), [Section("Margins in the hold phase", [margin_table(summary)])]
     )
+
+
+def _format_worst(summary: Margins) -> str:
+    return f"smallest margins at one input: {format_margins(summary.worst)}"
 
 
 def margin_table(summary: Margins) -> Table:
@@ -50,7 +53,10 @@ def margin_table(summary: Margins) -> Table:
 def _condition_lines(summary: Margins) -> Iterator[str]:
     """Return the conditions under which the margins hold, and warnings."""
     if summary.stable and not summary.open:
-        yield "these are the smallest margins at any input, in the hold phase and the frozen approach phase"
+        times = sorted(loop["time_to_go"] for loop in summary.before if loop["judged"])
+        approach = f" and, with frozen gains, at {_format_times(times)}" if times else ""
+        yield f"margins are judged in the hold phase{approach}"
+        yield "margins at all inputs together and at the sensors are not judged; they can be smaller, see the table"
     if summary.limit_cycle is not None:
         yield from limit_cycle_lines(summary.limit_cycle)
     if summary.start_deg is not None:
@@ -63,7 +69,7 @@ def _condition_lines(summary: Margins) -> Iterator[str]:
             f"{summary.dispersed} dispersed loops"
         )
     for judged, caveat in (
-        (True, ""), (False, "; there the gains change too fast for frozen gains to mean much"),
+        (True, ""), (False, "; this is not judged, because frozen gains mean little there"),
     ):  # fmt: skip
         times = sorted(loop["time_to_go"] for loop in summary.before if not loop["stable"] and loop["judged"] == judged)
         if times:

@@ -178,12 +178,13 @@ def write(folder: Path, ready: Study, course: Course, figures: bool) -> None:
     t_f = float(ready.parts.controller.t_f)
     rows = [
         [t, t_f - t, name, *(float(getattr(course.at_input, field)[j, k]) for field in (*FIELDS, "crossover")),
-         int(course.at_input.stable[j, k])]
+         int(course.at_input.stable[j, k]), int(course.judged[j])]
         for j, t in enumerate(course.t.tolist())
         for k, name in enumerate(inputs)
     ]  # fmt: skip
-    units = ("gain_up_dB", "gain_down_dB", "phase_deg", "delay_s", "peak_sensitivity_dB", "crossover_rad_s", "stable")
-    store.write_csv(folder / "margins.csv", ["t", "time_to_go", "axis", *units], rows)
+    columns = ["t", "time_to_go", "axis", "gain_up_dB", "gain_down_dB", "phase_deg", "delay_s", "peak_sensitivity_dB",
+               "crossover_rad_s", "stable", "judged"]  # fmt: skip
+    store.write_csv(folder / "margins.csv", columns, rows)
     if figures:
         from ptsmc_jax.figures import style
 
@@ -201,6 +202,6 @@ def figures_of(ready: Study, course: Course) -> dict[str, "Figure"]:
         "nichols": margin_plots.nichols(responses, inputs),
         "sensitivity": margin_plots.sensitivity(w, responses, inputs),
         "margins": margin_plots.margins_over_time(
-            float(ready.parts.controller.t_f) - course.t[:-1], course.before_hand_over, hold
+            float(ready.parts.controller.t_f) - course.t[:-1], course.judged[:-1], course.before_hand_over, hold
         ),
     }
