@@ -84,10 +84,11 @@ def signals(t: np.ndarray, panels: list[tuple[str, np.ndarray, np.ndarray]]) -> 
     figure, axes = _panels([label for label, *_ in panels], "Measured (dots) and predicted (lines)")
     drawn = _select_rows(len(t))
     for panel, (_, measured, predicted) in zip(axes, panels, strict=True):
-        for k, (colour, _) in zip(range(measured.shape[1]), style.STYLES, strict=False):
+        for k in range(measured.shape[1]):
+            colour, _ = style.STYLES[k % len(style.STYLES)]
             panel.plot(t[drawn], measured[drawn, k], ".", ms=2, color=colour, alpha=0.4)
             panel.plot(t[drawn], predicted[drawn, k], "-", lw=0.9, color=colour, label=f"component {k + 1}")
-    axes[0].legend(ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0))
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower left", ncols=6)
     return figure
 
 
@@ -123,7 +124,8 @@ def autocorrelation(names: list[str], values: np.ndarray, counts: np.ndarray) ->
         values: (lags, components) [-].
         counts: number of readings of each component.
     """
-    figure, axes = _panels(names, "Autocorrelation of the innovations and its 95 % band", "lag [readings]")
+    labels = [f"{name} [-]" for name in names]
+    figure, axes = _panels(labels, "Autocorrelation of the innovations and its 95 % band", "lag [readings]")
     lags = np.arange(1, len(values) + 1)
     for k, panel in enumerate(axes):
         half_width = 1.96 / np.sqrt(max(counts[k], 1))
@@ -155,7 +157,7 @@ def estimates(table: "DataFrame") -> Figure:
     axes.set_yticks(range(len(rows)), [row["parameter"] for row in rows])
     axes.invert_yaxis()
     axes.set_title("Estimates with 95 % intervals; grey: prior knowledge", loc="left")
-    axes.set_xlabel("change in % of the largest number of the parameter")
+    axes.set_xlabel("change [% of the largest number of the parameter]")
     return figure
 
 

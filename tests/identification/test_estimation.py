@@ -96,6 +96,10 @@ def test_a_notebook_shows_the_verdict_the_estimates_and_the_figures_of_each_log(
     each = ("innovations", "autocorrelation", "prediction")
     assert set(found.plot()) == {"estimates", *each, *(f"{name}_2" for name in each)}
     assert list(found.plot("prediction_2")) == ["prediction_2"]
+    axes = found.plot("innovations")["innovations"].axes[0]
+    assert axes.get_ylabel() == "attitude_x [arcsec]"
+    first = results.innovations(found.fits[0])[0][0, 0]  # [rad]
+    np.testing.assert_allclose(np.asarray(axes.lines[0].get_ydata())[0], np.rad2deg(first) * 3600.0, rtol=1e-12)
 
 
 def test_innovations_of_the_attitude_are_drawn_in_arcsec(identified):
