@@ -160,8 +160,8 @@ def test_cells_agree_with_separate_simulations_of_their_pair(mapped, monkeypatch
             for name, (left, radius) in zip(("", "hold_"), ends.values(), strict=True):
                 np.testing.assert_allclose(getattr(cell, f"{name}radius"), radius, rtol=1e-9)
                 np.testing.assert_allclose(getattr(cell, f"{name}delay_margin"), left.delay.min(), rtol=1e-6)
-                factor = 10.0 ** (left.gain_up.min() / 20.0)
-                np.testing.assert_allclose(getattr(cell, f"{name}gain_margin"), factor, rtol=1e-6)
+                gain_margin = min(left.gain_up.min(), left.gain_down.min())  # [dB]
+                np.testing.assert_allclose(getattr(cell, f"{name}gain_margin"), gain_margin, rtol=1e-6)
         if cell.status == "simulated":
             assert (cell.trials, cell.failures) == (6, 0)
             assert np.isfinite(cell.linear_window_error) == (cell.radius < 1.0)
@@ -190,7 +190,8 @@ def test_margins_of_a_pd_law_agree_with_the_closed_form():
             return np.abs(np.linalg.eigvals(moved - factor * pushed @ np.array([[cell.x, cell.y]]))).max()
 
         assert cell.hold_radius == pytest.approx(1.0, abs=1e-9)  # pole of a memory state without input
-        assert radius(0.999 * cell.hold_gain_margin) < 1.0 < radius(1.001 * cell.hold_gain_margin)
+        factor = 10.0 ** (cell.hold_gain_margin / 20.0)
+        assert radius(0.999 * factor) < 1.0 < radius(1.001 * factor)
         assert 0.0 < cell.hold_delay_margin < 10.0
         assert np.isnan(cell.linear_window_error)  # the prediction is validated for the prescribed-time law only
 
@@ -259,15 +260,15 @@ def test_stability_limits_are_drawn_over_period_and_delta_only():
     loaded, x, y = asked("controller.delta=0.2:0.9:2", "loop.period=0.05:0.1:2")
     for clock, factor, label in (("anchored", 1.5, "3/2"), ("flight", 2.5, "1/2")):
         lines = mapping.stability_limit_curves(scenario.replace(loaded, loop__clock=clock), x, y)
-        delta, period = lines[f"$\\delta = (\\eta - {label}) h$"]
+        delta, period = lines[f"stability limit $\\delta = (\\eta - {label}) h$"]
         np.testing.assert_allclose(delta, factor * np.asarray(period))
     lines = mapping.stability_limit_curves(
         scenario.replace(loaded, controller__sampling="implicit"), x, y
     )  # the limit of explicit sampling for comparison
     np.testing.assert_allclose(
-        lines["$\\delta = (\\eta - 1/2) h$, of explicit sampling only"][0], 2.5 * np.asarray(y.values)
+        lines["stability limit $\\delta = (\\eta - 1/2) h$, of explicit sampling only"][0], 2.5 * np.asarray(y.values)
     )
-    delta, period = lines["with a period of delay"]
+    delta, period = lines["stability limit with a period of delay"]
     assert np.all(delta < mapping.stability_limit_curves(loaded, x, y)["the same with a period of delay"][0])
     assert not mapping.stability_limit_curves(loaded, x, mapping.parse_axis("controller.eta=3:4:2", "--y"))
     third = scenario.from_tables({"plant": {"kind": "chain", "order": 3}, "loop": {"mode": "sampled"}})
@@ -297,7 +298,7 @@ def test_map_command_writes_its_result_folder(command, mapped, tmp_path):
     read = checked(folder)
     assert f"ptsmc {' '.join(asked)} --trials 6 --seed 3" in read.text
     assert "linear_torque [u]" in read.text
-    assert "gain_margin [" not in read.text  # a factor without a unit
+    assert "hold_gain_margin [dB]" in read.text
     first = out.splitlines()[0]
     assert first.startswith("the smallest RMS error is ")
     assert read.text.index(first[1:]) < read.text.index("Pairs")
@@ -335,7 +336,7 @@ def test_spillover_limit_separates_stable_and_unstable_pairs(monkeypatch):
     loaded, x, y, cells = simulated(*MODES)
     # all pairs are unstable at the hand-over, so that the only limit is in the hold phase
     ((label, (across, up)),) = mapping.spillover_limit_curves(mapping.Map(loaded, x, y, cells)).items()
-    assert label == "the same in hold"
+    assert label == "stability limit in the hold phase, linear theory"
     drawn = np.isfinite(across)
     np.testing.assert_allclose(across[drawn], 6.0 - 1.6 * (up[drawn] - 1.5), atol=1e-4)
     assert (up[drawn].min(), up[drawn].max()) == (1.0, 2.0)

@@ -26,8 +26,8 @@ autocorrelation."""
 MAP_NOTE = (
     "linear_window_error and linear_torque are predictions of linear theory for the noise alone, with explicit "
     "sampling. radius, gain_margin and delay_margin belong to the loop at the hand-over with frozen gains, hold_radius "
-    "and the others with hold_ to the hold phase. The loop is stable up to a radius of 1. gain_margin is the largest "
-    "factor on the gain with a stable loop; below 1 the loop is unstable."
+    "and the others with hold_ to the hold phase. The loop is stable up to a radius of 1. gain_margin and "
+    "delay_margin are those of the worst axis; they are not positive if the loop is unstable."
 )
 
 
@@ -179,13 +179,14 @@ def _count_failures(pair: Mapping[str, Any]) -> float:
 
 
 def _map_column(name: str, *cells: str, plant: str) -> tuple[str, ...]:
-    """Return a column of map.csv with a readable unit in its heading. Gain margins of a map are factors."""
+    """Return a column of map.csv with a readable unit in its heading."""
     values = [value for cell in cells if not isinstance(value := parse_cell(cell), str)]
     if len(values) < len(cells):
         return name, *cells
-    metric = re.sub("^(linear|largest|hold)_(?=torque|peak|window|delay)", "", name)
+    metric = re.sub("^(linear|largest|hold)_(?=torque|peak|window|delay|gain)", "", name)
     units = catalogues.units(plant)
-    unit = {**units, "torque": units["peak_torque"], "delay_margin": "s"}.get(metric, "-")
+    units |= {"torque": units["peak_torque"]} | {margin: entry.unit for margin, entry in catalogues.MARGINS.items()}
+    unit = units.get(metric, "-")
     unit, numbers = in_readable_unit(metric, unit, *values)
     return heading(name, unit), *(format_number(number, ".4g", "") for number in numbers)
 

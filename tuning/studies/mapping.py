@@ -60,9 +60,9 @@ class Cell:
     linear_window_error: float = np.nan  # error due to noise alone, by linear covariance analysis
     linear_torque: float = np.nan  # torque due to noise alone, by linear covariance analysis [N m]
     radius: float = np.nan  # spectral radius of the frozen loop at the hand-over [-]
-    gain_margin: float = np.nan  # gain margin at the hand-over, as a factor [-]
+    gain_margin: float = np.nan  # gain margin at the hand-over [dB]
     delay_margin: float = np.nan  # delay margin at the hand-over [s]
-    hold_gain_margin: float = np.nan  # gain margin in the hold phase, as a factor [-]
+    hold_gain_margin: float = np.nan  # gain margin in the hold phase [dB]
     hold_delay_margin: float = np.nan  # delay margin in the hold phase [s]
     hold_radius: float = np.nan  # spectral radius of the frozen loop in the hold phase [-]
 
@@ -246,10 +246,8 @@ def _simulate_pair(x: float, y: float, ready: Study, parts: Parts, seed: int, tr
     if ready.scenario.sampled:
         ends = run_margins.margins_at_ends(parts)
         for prefix, (axis_margins, radius) in (("", ends["hand_over"]), ("hold_", ends["hold"])):
-            # Gain margin of the worst axis as a factor. If the loop is unstable, the factor is below 1. The nearest
-            # stability limit is then at this gain factor or at its inverse.
-            results[f"{prefix}gain_margin"] = float(10.0 ** (axis_margins.gain_up.min() / 20.0))
-            results[f"{prefix}delay_margin"] = float(axis_margins.delay.min())
+            worst = axis_margins.worst()
+            results |= {f"{prefix}{name}": float(worst[name]) for name in ("gain_margin", "delay_margin")}
             results[f"{prefix}radius"] = radius
         # the prediction has been compared with simulated trials for the prescribed-time law only
         if (
@@ -281,10 +279,11 @@ def stability_limit_curves(scenario: Scenario, x: Axis, y: Axis) -> dict[str, tu
     eta, delay = scenario.controller.eta, scenario.devices.delay_periods
     h = np.asarray(x.values if x.key == PERIOD else y.values)
     anchored = scenario.loop.clock == "anchored"
-    implicit, formula = scenario.controller.implicit, f"$\\delta = (\\eta - {3 if anchored else 1}/2) h$"
+    implicit = scenario.controller.implicit
+    formula = f"stability limit $\\delta = (\\eta - {3 if anchored else 1}/2) h$"
     # without delay, implicit sampling has no stability limit; the limit of explicit sampling is drawn instead
     label_without_delay = f"{formula}, of explicit sampling only" if implicit else formula
-    label_with_delay = "with {} of delay" if implicit else "the same with {} of delay"
+    label_with_delay = "stability limit with {} of delay" if implicit else "the same with {} of delay"
     delays = {label_without_delay: 0.0, label_with_delay.format("a period"): 1.0}
     if delay > 1:
         delays[label_with_delay.format(f"{delay} periods")] = float(delay)
@@ -309,14 +308,16 @@ def spillover_limit_curves(simulated: Map) -> dict[str, tuple[np.ndarray, np.nda
     axes = simulated.x, simulated.y
     x_values, y_values = (np.log(axis.values) if axis.logarithmic else np.asarray(axis.values) for axis in axes)
     curves = {}
-    labels = {"radius": "stability limit by linear theory, at the hand-over", "hold_radius": "the same in hold"}
-    for name, label in labels.items():
+    phases = {"radius": "at the hand-over", "hold_radius": "in the hold phase"}
+    for name, phase in phases.items():
         grid = simulated.grid(name)
         log_radius = np.ma.masked_invalid(np.log(np.where(grid > 0.0, grid, np.nan)))
         pieces: Any = contour_generator(x_values, y_values, log_radius).lines(margins.CIRCLE_TOLERANCE)
         if pieces:
             points = np.concatenate([np.vstack([piece, [[np.nan, np.nan]]]) for piece in pieces])
-            curves[label] = tuple(np.exp(v) if axis.logarithmic else v for axis, v in zip(axes, points.T, strict=True))
+            curves[f"stability limit {phase}, linear theory"] = tuple(
+                np.exp(v) if axis.logarithmic else v for axis, v in zip(axes, points.T, strict=True)
+            )
     return curves
 
 
