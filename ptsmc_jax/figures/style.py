@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from ptsmc_jax.formulas import ARCSEC
+from ptsmc_jax.scenario.tables import LIMITS, T_F
 from ptsmc_jax.simulation.catalogues import CATALOGUES, as_angle
 
 # colours of Okabe and Ito, distinct for the colour-blind; line styles are distinct in grey
@@ -41,6 +42,14 @@ def new_figure(title: str, ylabel: str) -> tuple[Figure, Axes]:
     axes.set(xlabel=TIME, ylabel=ylabel)
     axes.set_title(title, loc="left", pad=19)
     return figure, axes
+
+
+def legend_below(figure: Figure, columns: int) -> None:
+    """Add a legend below the axes of a figure with one plot, and enlarge the figure for it."""
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    rows = -(-len(labels) // columns)
+    figure.set_size_inches(8.0, 4.5 + 0.26 * rows)
+    figure.legend(handles, labels, loc="outside lower left", ncols=columns, fontsize=9, frameon=False)
 
 
 def with_unit(name: str, unit: str) -> str:
@@ -79,6 +88,22 @@ def metric_display(metric: str, plant: str) -> tuple[Callable[[ArrayLike], np.nd
     if unit == "rad":
         return lambda values: ARCSEC * np.asarray(as_angle(metric, stated_unit, values)[1]), "arcsec"
     return np.asarray, unit
+
+
+def objective_display(name: str, minimised: str, plant: str) -> tuple[Callable[[ArrayLike], np.ndarray], str]:
+    """Return how figures show the objective of a search: a function of its value, and its label with the unit.
+
+    Args:
+        name: the objective in words, see `tables.objective_name`.
+        minimised: the minimised metric, or `T_F` or `LIMITS` of `scenario.tables`.
+        plant: kind of the plant.
+    """
+    if minimised in (T_F, LIMITS):
+        return np.asarray, with_unit(name, "s" if minimised == T_F else "-")
+    convert, unit = metric_display(minimised, plant)
+    if minimised == "window_error":
+        name = name.replace("window error", error_display(plant)[1])
+    return convert, with_unit(name, unit)
 
 
 def plain_ticks(line: Axis) -> None:

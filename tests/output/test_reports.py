@@ -14,7 +14,9 @@ import polars as pl
 import pytest
 
 from ptsmc_jax.campaigns.store import to_json_value
+from ptsmc_jax.figures import style
 from ptsmc_jax.numerics import statistics
+from ptsmc_jax.scenario.tables import Tune, objective_name
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.catalogues import MARGINS
 from ptsmc_jax.simulation.requirements import Requirement
@@ -559,18 +561,24 @@ def test_driver_explains_a_significant_part_of_the_variance(correlation, trials,
 @pytest.mark.parametrize(
     ("plant", "objective", "shown", "title"),
     [
-        ("spacecraft", "rms_window_error", np.degrees(2.0 * np.arcsin(1e-5)) * 3600.0, "rms pointing error [arcsec]"),
-        ("spacecraft", "rms_hold_angle", np.degrees(1e-5) * 3600.0, "rms hold angle [arcsec]"),
-        ("spacecraft", "mean_peak_torque", 1e-5, "mean peak torque [N m]"),
-        ("chain", "rms_window_error", 1e-5, "rms error [x1]"),
-        ("chain", "objective_t_f", 1e-5, "objective t f [s]"),
+        ("spacecraft", "window_error", np.degrees(2.0 * np.arcsin(1e-5)) * 3600.0, "RMS pointing error [arcsec]"),
+        ("spacecraft", "hold_angle", np.degrees(1e-5) * 3600.0, "RMS hold angle [arcsec]"),
+        ("spacecraft", "peak_torque", 1e-5, "RMS peak torque [N m]"),
+        ("chain", "window_error", 1e-5, "RMS error [x1]"),
+        ("chain", "t_f", 1e-5, "RMS t f [s]"),
     ],
 )
 def test_chart_of_a_search_shows_the_objective_in_the_unit_of_the_figures(plant, objective, shown, title):
-    rows = [{"step": "0", "start": "0", objective: "1e-05", "eta": "3"}]
-    chart = page_charts.search(rows, objective, plant)
+    rows = [{"step": "0", "start": "0", "objective": "1e-05", "eta": "3"}]
+    display = style.objective_display(f"RMS {objective}".replace("_", " "), objective, plant)
+    chart = page_charts.search(rows, "objective", *display)
     assert chart["data"][0]["y"] == pytest.approx([shown], rel=1e-5)  # with six digits
     assert chart["layout"]["yaxis"]["title"]["text"] == title
+
+
+@pytest.mark.parametrize(("minimised", "label"), [("t_f", "t_f [s]"), ("effort", "RMS effort [N m s]")])
+def test_an_objective_has_its_unit(minimised, label):
+    assert style.objective_display(objective_name(Tune(minimise=minimised)), minimised, "spacecraft")[1] == label
 
 
 if __name__ == "__main__":

@@ -21,7 +21,9 @@ import numpy as np
 
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.store import RefusedError
+from ptsmc_jax.figures.style import objective_display
 from ptsmc_jax.scenario import parsing
+from ptsmc_jax.scenario.tables import Tune, objective_name
 from tuning.errors import UsageError
 from tuning.output import campaign_report, compare_report, page_charts, reports, summaries
 from tuning.output.report import Block, Chart, Code, Picture, Section, Table
@@ -217,7 +219,10 @@ def _search_chart(result: Result) -> Chart:
     head, *rows = _read_rows(result.folder / "history.csv")
     points = [dict(zip(head, row, strict=True)) for row in rows]
     caption = "The objective along the local search from each starting point; a hollow point breaks a limit."
-    return Chart("search", page_charts.search(points, head[2], result.plant), caption)
+    tune = result.scenario.get("tune", {})
+    objective = Tune(**{key: tune[key] for key in ("minimise", "statistic", "level") if key in tune})
+    display = objective_display(objective_name(objective), objective.minimise, result.plant)
+    return Chart("search", page_charts.search(points, head[2], *display), caption)
 
 
 def _front_chart(result: Result) -> Chart:

@@ -1,13 +1,12 @@
 """Interactive charts of a result, as Plotly's JSON: histories, a turning body, a front, a search."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from ptsmc_jax.figures import animation
-from ptsmc_jax.figures.style import STYLES, error_display, metric_display
-from tuning.output.formats import error_name, heading, objective_metric
+from ptsmc_jax.figures.style import STYLES, error_display
 from tuning.studies.front import Front, Point, unit_of
 
 Chart = dict[str, Any]
@@ -204,19 +203,17 @@ def laws(
     return {"data": data, "layout": _layout(xaxis=x_axis, yaxis=y_axis, shapes=lines, annotations=notes)}
 
 
-def search(rows: Sequence[Mapping[str, str]], objective: str, plant: str) -> Chart:
+def search(
+    rows: Sequence[Mapping[str, str]], objective: str, convert: Callable[[np.ndarray], np.ndarray], title: str
+) -> Chart:
     """Return the chart of the objective over the steps of every local search; hollow points break a limit.
 
     Args:
         rows: the rows of `history.csv`, by column.
-        objective: column of the objective, in the unit of the figures.
-        plant: kind of the plant.
+        objective: column of the objective.
+        convert: function of the objective that returns the shown value, see `style.objective_display`.
+        title: name of the objective and the unit of the shown value.
     """
-    convert, unit = np.asarray, "s" if objective.endswith("t_f") else ""
-    metric = objective_metric(objective, plant)
-    if metric:
-        convert, unit = metric_display(metric, plant)
-    title = heading(objective.replace("window_error", error_name(plant)), unit)
     starts: dict[str, list[Mapping[str, str]]] = {}
     for row in rows:
         starts.setdefault(row["start"], []).append(row)
@@ -235,7 +232,7 @@ def search(rows: Sequence[Mapping[str, str]], objective: str, plant: str) -> Cha
             "marker": {"size": 6, "symbol": ["circle" if one else "circle-open" for one in met]},
             "line": {"width": 1, "color": COLOURS[k % len(COLOURS)]},
         })  # fmt: skip
-    y_axis = {"title": {"text": title.replace("_", " ")}, **_DECADES}
+    y_axis = {"title": {"text": title}, **_DECADES}
     return {"data": data, "layout": _layout(xaxis={"title": {"text": "step of the local search"}}, yaxis=y_axis)}
 
 

@@ -1,6 +1,7 @@
 """The result folder of `ptsmc tune`: summary, history, tuned scenario and figures. Read `write` first."""
 
 import itertools
+import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -256,12 +257,8 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, "Figure"]:
         padding = np.full_like(np.asarray(value(paths[0][0])), missing)
         return np.stack([[value(path[k]) if k < len(path) else padding for path in paths] for k in range(longest)])
 
-    minimised, to_unit = scenario.search.minimise, np.asarray
-    if minimised in (T_F, LIMITS):
-        unit = {T_F: "s", LIMITS: "-"}[minimised]
-    else:
-        to_unit, unit = style.metric_display(minimised, kind)
-    objective = f"{objective_name(scenario.search).replace(' window', chr(10) + 'window')} [{unit}]"
+    to_unit, objective = style.objective_display(objective_name(scenario.search), scenario.search.minimise, kind)
+    objective = "\n[".join(textwrap.fill(part, 24) for part in objective.split(" ["))  # longer than an axis
     gains = over_steps(lambda step: step.gains)
     figures: dict[str, Figure] = {
         "history": study_plots.tuning_history(
