@@ -8,19 +8,29 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ptsmc_jax.figures.style import LIMIT, STYLES, error_display, logarithmic, new_figure, styled, with_unit
+from ptsmc_jax.figures.style import (
+    LIMIT,
+    STYLES,
+    error_display,
+    legend_below,
+    logarithmic,
+    new_figure,
+    styled,
+    with_unit,
+)
 from ptsmc_jax.formulas import angle_unit
 from ptsmc_jax.simulation.catalogues import percent
 from ptsmc_jax.simulation.requirements import quantity
 
 BANDS = ((99.7, "0.85"), (90.0, "0.68"), (50.0, "0.45"))  # central fraction of the trials [%], grey
-# outcomes of complete runs beyond a limit: a limit on a fraction of the time may still be met
+# outcomes of complete runs, which have the status "ok": a limit on a fraction of the time may still be met
+KEPT = "converged, every limit kept"
 AT_TIMES = "beyond a limit that may be left at times"
 BEYOND = "beyond a limit"
-COMPLETE = ("ok", AT_TIMES, BEYOND, "not_converged")  # outcomes of trials that reached the end
+COMPLETE = (KEPT, AT_TIMES, BEYOND, "not_converged")  # outcomes of trials that reached the end
 # outcome: colour, marker, size
 MARKS = {
-    "ok": (STYLES[0][0], "o", 6.0),
+    KEPT: (STYLES[0][0], "o", 6.0),
     AT_TIMES: ("#E69F00", "v", 10.0),
     BEYOND: ("#CC79A7", "D", 8.0),
     "not_converged": (STYLES[1][0], "^", 16.0),
@@ -145,8 +155,8 @@ def torque_by_angle(
     if finished.size and finished.min() > 0.0:
         shown = [*finished, limit] if limit else finished
         logarithmic(axes, "y")
-        axes.set_ylim(min(shown) / 1.3, max(shown) * 1.5)
-    axes.legend(fontsize=9)
+        axes.set_ylim(min(shown) / 1.3, max(shown) * 1.3)
+    legend_below(figure, columns=2)
     return figure
 
 
@@ -166,7 +176,7 @@ def inputs(
         for axes, x in zip(line, drawn.values(), strict=True):
             _scatter_by_outcome(axes, x.values, column.values, outcome, totals)
             if column.limit is not None:
-                axes.axhline(column.limit, **LIMIT)
+                axes.axhline(column.limit, **LIMIT, label="limit")
             if known.size and known.min() > 0.0 and known.max() > 10.0 * known.min():
                 logarithmic(axes, "y")
         line[0].set_ylabel(column.label(metric).replace(" [", "\n["))  # too long for one line

@@ -52,8 +52,8 @@ def test_each_outcome_is_counted_and_drawn():
     ):
         drawn = np.all(np.asarray(points.get_linewidth()) > 0.0)
         assert drawn or MarkerStyle(marker).is_filled(), marker  # otherwise it is invisible
-    simulated = x[np.isin(outcome, ("ok", campaign_plots.AT_TIMES, campaign_plots.BEYOND, "not_converged"))]
-    assert axes.get_ylim() == pytest.approx((simulated.min() / 1.3, simulated.max() * 1.5))
+    simulated = x[np.isin(outcome, campaign_plots.COMPLETE)]
+    assert axes.get_ylim() == pytest.approx((simulated.min() / 1.3, simulated.max() * 1.3))
 
 
 @pytest.mark.parametrize("limit", [1e-3, 1e3])
@@ -68,9 +68,9 @@ def test_a_limit_in_the_legend_is_on_the_axis(limit):
 
 @pytest.mark.parametrize(("unit", "shown", "factor"), [("rad", "[deg]", 180.0 / np.pi), ("x1", "[x1]", 1.0)])
 def test_initial_angles_are_drawn_in_the_unit_of_their_axis(unit, shown, factor):
-    angle, outcome = np.array([0.5, 1.0, 2.0]), np.full(3, "ok", dtype=object)
+    angle, outcome = np.array([0.5, 1.0, 2.0]), np.full(3, campaign_plots.KEPT, dtype=object)
     start, torque = campaign_plots.Column(unit, angle).in_readable_unit(), campaign_plots.Column("N m", angle)
-    (axes,) = campaign_plots.torque_by_angle(start, torque, outcome, {"ok": 3}).axes
+    (axes,) = campaign_plots.torque_by_angle(start, torque, outcome, {campaign_plots.KEPT: 3}).axes
     assert axes.get_xlabel().endswith(shown)
     np.testing.assert_allclose(np.asarray(axes.collections[0].get_offsets())[:, 0], factor * angle)
 

@@ -47,7 +47,7 @@ def build(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
         )
     outcome = _classify_trials(frame, required)
     totals = {name: int((outcome == name).sum()) for name in plots.MARKS}
-    is_good = np.isin(outcome, ("ok", plots.AT_TIMES))
+    is_good = np.isin(outcome, (plots.KEPT, plots.AT_TIMES))
     bad_trials, good_trials = np.flatnonzero(~is_good)[: SCATTER_TRIALS // 2], np.flatnonzero(is_good)
     # failed trials and trials beyond a limit come last, so that their marks are on top
     plotted = np.concatenate([good_trials[: SCATTER_TRIALS - bad_trials.size], bad_trials])
@@ -76,12 +76,13 @@ def _classify_trials(frame: pl.DataFrame, required: Sequence[Requirement]) -> np
     """
     outcome = frame["status"].to_numpy().astype(object)
     ok = outcome == "ok"
+    outcome[ok] = plots.KEPT
     for requirement in required:
         is_beyond = ok & ~(frame[requirement.metric].to_numpy() <= requirement.limit)
         is_broken = is_beyond if requirement.timed is None else np.zeros_like(ok)
         if requirement.timed is not None and requirement.interpretation == "temporal":
             is_broken = ok & ~(frame[requirement.timed].to_numpy() >= requirement.quantile)
-        outcome[is_beyond & (outcome == "ok")] = plots.AT_TIMES
+        outcome[is_beyond & (outcome == plots.KEPT)] = plots.AT_TIMES
         outcome[is_broken] = plots.BEYOND
     return outcome
 
