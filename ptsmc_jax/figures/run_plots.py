@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from ptsmc_jax.figures.style import LIMIT, STYLES, error_display, new_figure, plain_ticks, with_unit
+from ptsmc_jax.figures.style import LIMIT, STYLES, error_display, legend_below, new_figure, plain_ticks, with_unit
 from ptsmc_jax.plants.base import Chart
 from ptsmc_jax.simulation.rollout import Log, Parts
 from ptsmc_jax.theory import envelopes, solutions
@@ -16,7 +16,6 @@ from ptsmc_jax.theory.lower_bound import LowerBound
 
 FAR_OFF = 3.0  # a limit or command beyond this multiple of the curves is only named in the legend
 SMALLEST, LARGEST = 1e-16, 1e100  # log axes end at SMALLEST; larger numbers than LARGEST are left out
-MANY_POINTS = 200_000  # with more points, the search of a place for the legend takes as long as drawing
 EXACT_LINE: Any = {"color": "0.25", "lw": 0.9, "ls": (0, (1, 1.5))}  # style of the line of the exact motion
 BOUND_LINE: Any = {"color": "0.35", "lw": 1.0, "ls": "--", "label": "bound, no noise"}
 
@@ -44,7 +43,7 @@ def state(parts: Parts, log: Log, chart: Chart, title: str | None = None) -> Fig
     if chart.with_reference:
         axes.plot(log.t, getattr(log.reference, chart.column), color="0.6", lw=1.0, zorder=1)
         axes.plot([], [], color="0.6", lw=1.0, label="reference")
-    _mark_t_f_and_add_legend(axes, parts, ncols=2)
+    _mark_t_f_and_add_legend(figure, parts)
     return figure
 
 
@@ -68,7 +67,7 @@ def error(parts: Parts, log: Log, lower_bound: LowerBound | None = None) -> Figu
     t_f = float(parts.controller.t_f)
     axes.axvspan(t_f, t_f + float(parts.window), color="0.85", label="window of window_error")
     _cut_axis(axes)
-    _mark_t_f_and_add_legend(axes, parts)
+    _mark_t_f_and_add_legend(figure, parts)
     return figure
 
 
@@ -95,7 +94,7 @@ def torque(parts: Parts, log: Log, limit: float | None = None, title: str | None
         axes.plot(log.t[row], peak, "o", mfc="none", color="black", label=label)
     if limit is not None:
         _draw_limit(axes, limit, unit)
-    _mark_t_f_and_add_legend(axes, parts)
+    _mark_t_f_and_add_legend(figure, parts)
     return figure
 
 
@@ -107,7 +106,7 @@ def wheels(parts: Parts, log: Log, index: int, title: str, quantity: str, unit: 
     limit = getattr(parts.actuators.wheels, f"{quantity}_limit", None)
     if limit is not None:
         _draw_limit(axes, float(limit), f" {unit}")
-    _mark_t_f_and_add_legend(axes, parts, ncols=2)
+    _mark_t_f_and_add_legend(figure, parts)
     return figure
 
 
@@ -120,7 +119,7 @@ def sliding(parts: Parts, log: Log) -> Figure:
         axes.plot(before, envelopes.sliding_bound(parts, before), **BOUND_LINE)
     axes.set_yscale("log")
     _cut_axis(axes)
-    _mark_t_f_and_add_legend(axes, parts)
+    _mark_t_f_and_add_legend(figure, parts)
     return figure
 
 
@@ -173,7 +172,7 @@ def disturbance(parts: Parts, log: Log) -> Figure:
         axes.plot(
             log.t, true, color="black", lw=1.2, ls=STYLES[k % len(STYLES)][1], zorder=5, label=f"true $d_{{{k + 1}}}$"
         )
-    _mark_t_f_and_add_legend(axes, parts, ncols=2)
+    _mark_t_f_and_add_legend(figure, parts)
     return figure
 
 
@@ -214,14 +213,13 @@ def _draw_limit(axes: Axes, limit: float, unit: str) -> None:
     axes.plot([], [], **LIMIT, label=f"limit {limit:g}{unit}")
 
 
-def _mark_t_f_and_add_legend(axes: Axes, parts: Parts, ncols: int = 1) -> None:
-    """Draw a line at the prescribed time, and add the legend where it covers the curves least."""
-    t_f = float(parts.controller.t_f)
+def _mark_t_f_and_add_legend(figure: Figure, parts: Parts) -> None:
+    """Draw a line at the prescribed time, and add a legend."""
+    (axes,), t_f = figure.axes, float(parts.controller.t_f)
     axes.axvline(t_f, color="0.3", lw=0.9, ls=":")
     axes.annotate(
         f"$t_f$ = {t_f:g} s", (t_f, 1.0), xycoords=("data", "axes fraction"), xytext=(0, 3),
         textcoords="offset points", ha="center", va="bottom", fontsize=9, color="0.3",
     )  # fmt: skip
     axes.margins(x=0.01)
-    points = sum(np.size(line.get_xdata()) for line in axes.lines)
-    axes.legend(ncols=ncols, loc="best" if points < MANY_POINTS else "upper right")
+    legend_below(figure, columns=3)

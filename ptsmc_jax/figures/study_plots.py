@@ -6,10 +6,13 @@ from typing import Any, NamedTuple
 import matplotlib
 import matplotlib.colors
 import matplotlib.lines
+import matplotlib.patches
 import matplotlib.ticker
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.path import Path
+from matplotlib.transforms import Bbox
 from numpy.typing import ArrayLike
 
 from ptsmc_jax.figures.style import (
@@ -17,6 +20,7 @@ from ptsmc_jax.figures.style import (
     LOWER_BOUND,
     STYLES,
     error_display,
+    legend_below,
     logarithmic,
     new_figure,
     plain_ticks,
@@ -29,6 +33,7 @@ MARKERS = ("o", "^", "s", "D", "v")
 BEYOND = ("x", "+", "1", "2", "3", "4")  # markers of points that violate a limit, one for each limit
 # marker of a pair with a failed trial, visible on any colour
 FAILED: Any = {"marker": "X", "color": "white", "mec": "black", "mew": 0.6, "ms": 6}
+NO_NUMBER = "0.9"  # grey of pairs without a number, which is not a colour of the map
 WIDEST = 1e4  # largest ratio of the values that the colours of a map span
 
 
@@ -98,6 +103,7 @@ def tuning_history(
         axes[0].semilogy(steps, values[:, start], color="0.75", lw=1.0)
         met = np.where(admissible[:, start], values[:, start], np.nan)
         axes[0].semilogy(steps, met, color=STYLES[0][0])
+    plain_ticks(axes[0].yaxis)
     axes[0].plot([], [], color=STYLES[0][0], label="requirements met")
     axes[0].plot([], [], color="0.75", label="beyond a limit")
     final_goal, final_gains = result
@@ -157,7 +163,9 @@ def profiles(gains: Mapping[str, Profile], goal: str) -> Figure:
             label = f"beyond the limit of {metric}"
             ax.semilogy(profile.gain[beyond], profile.goal[beyond], mark, color=STYLES[1][0], label=label)
         if not np.any(np.isfinite(profile.goal)):
-            ax.text(0.5, 0.5, "no goal: no trial ends", transform=ax.transAxes, ha="center", va="center")
+            ax.text(
+                0.5, 0.5, "no objective: no trial reaches its end", transform=ax.transAxes, ha="center", va="center"
+            )
         ax.axvline(profile.tuned, color="0.3", lw=0.9, ls=":", label="tuned")
         if is_log_scaled(profile.gain[0], profile.gain[-1]):
             logarithmic(ax, "x")
@@ -198,15 +206,8 @@ def tradeoff(
     axes.set_xlabel(f"{name} in the window [{error_unit}]")
     for line in (axes.xaxis, axes.yaxis):
         plain_ticks(line)
-    _legend_below(figure, len(arrays) + 2, columns=1)
+    legend_below(figure, columns=1)
     return figure
-
-
-def _legend_below(figure: Figure, entries: int, columns: int) -> None:
-    """Add a legend outside of the axes and enlarge the figure for it."""
-    rows = -(-entries // columns)
-    figure.set_size_inches(8.0, 4.5 + 0.26 * rows)
-    figure.legend(loc="outside lower left", ncols=columns, fontsize=9, markerscale=1.0)
 
 
 def settling_by_angle(sets: Mapping[str, tuple[np.ndarray, np.ndarray]], t_f: float) -> Figure:
@@ -220,7 +221,7 @@ def settling_by_angle(sets: Mapping[str, tuple[np.ndarray, np.ndarray]], t_f: fl
     axes.annotate("$t_f$", (1.0, t_f), xycoords=("axes fraction", "data"), xytext=(4, 0), textcoords="offset points",
                   va="center")  # fmt: skip
     axes.set_xlabel("initial angle [deg]")
-    _legend_below(figure, len(sets), columns=2)
+    legend_below(figure, columns=2)
     return figure
 
 
@@ -265,7 +266,7 @@ def front(
     axes.set_xlabel(f"largest peak torque [{unit}]")
     for line in (axes.xaxis, axes.yaxis):
         plain_ticks(line)
-    axes.legend(fontsize=9)
+    legend_below(figure, columns=3)
     return figure
 
 
@@ -321,7 +322,7 @@ def _draw_colour_map(axes: Axes, x: MapAxis, y: MapAxis, grid: np.ndarray, same_
     for line, map_axis in ((axes.xaxis, x), (axes.yaxis, y)):
         if not map_axis.logarithmic and all(float(value).is_integer() for value in map_axis.values):
             line.set_major_locator(matplotlib.ticker.MaxNLocator(integer=True))  # a delay is a whole number of periods
-    axes.set_facecolor("0.9")  # pairs without a number are grey, which is not a colour of the map
+    axes.set_facecolor(NO_NUMBER)
     mesh = axes.pcolormesh(x.edges, y.edges, np.ma.masked_invalid(grid), norm=norm, cmap="cividis")
     bar = axes.figure.colorbar(mesh, ax=axes, extend="max" if known.size and known.max() > high else "neither")
     plain_ticks(bar.ax.yaxis)
@@ -350,7 +351,7 @@ def accuracy_map(
     grids = {name: convert(grid) if "error" in name else grid for name, grid in grids.items()}
     titles = {
         "window_error": f"RMS {error} in the window [{error_unit}]",
-        "linear_window_error": f"its part from noise, linear theory [{error_unit}]",
+        "linear_window_error": f"RMS error from noise, linear theory [{error_unit}]",
         "peak_torque": f"mean peak torque [{unit}]",
         "largest_peak_torque": f"largest peak torque [{unit}]",
     }
@@ -364,7 +365,8 @@ def accuracy_map(
         _draw_colour_map(axes, x, y, grids[name], [grids[other] for other in drawn if kind_of_number in other])
         axes.plot(column[failed], row[failed], ls="", **FAILED)
         limits = axes.get_xlim(), axes.get_ylim()
-        for (label, line), style in zip(limit_lines.items(), ("-", "--", ":"), strict=False):
+        lines = {label: line for label, line in limit_lines.items() if _is_inside(axes, line)}
+        for (label, line), (_, style) in zip(lines.items(), STYLES, strict=False):
             axes.plot(*line, color="white", lw=3.0, ls=style)
             axes.plot(*line, color="black", lw=1.4, ls=style, label=label)
         axes.set(xlim=limits[0], ylim=limits[1])
@@ -380,6 +382,16 @@ def accuracy_map(
     if np.any(failed):
         handles.append(matplotlib.lines.Line2D([], [], ls="", **FAILED))
         labels.append("a trial failed or did not converge at t_f")
+    if not all(np.all(np.isfinite(grids[name])) for name in drawn):
+        handles.append(matplotlib.patches.Patch(color=NO_NUMBER))
+        labels.append("no result")
     if handles:
-        figure.legend(handles, labels, loc="outside upper left", ncols=len(handles))
+        figure.legend(handles, labels, loc="outside upper left", ncols=2)
     return figure
+
+
+def _is_inside(axes: Any, line: tuple[np.ndarray, np.ndarray]) -> bool:
+    """Return whether a part of a line (x, y) is inside the axes."""
+    points = (axes.transScale + axes.transLimits).transform(np.stack(line, axis=1))  # 0 to 1 inside the axes
+    points = points[np.all(np.isfinite(points), axis=1)]
+    return len(points) > 0 and Path(points).intersects_bbox(Bbox.unit(), filled=False)

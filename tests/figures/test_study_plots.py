@@ -107,7 +107,9 @@ def test_a_profile_with_few_values_shows_the_whole_interval_of_its_gain(known):
     low, high = figure.axes[0].get_xlim()
     assert low < 1e-3
     assert high > 1.0
-    assert [text.get_text() for text in figure.axes[0].texts] == ["no goal: no trial ends"] * (not known)
+    assert [text.get_text() for text in figure.axes[0].texts] == ["no objective: no trial reaches its end"] * (
+        not known
+    )
 
 
 @pytest.mark.parametrize(("limit", "drawn"), [(2.9, True), (3.1, False)])
@@ -142,6 +144,16 @@ def test_numbers_of_a_maps_logarithmic_axis_do_not_overlap(low, high):
     up = study_plots.MapAxis("delta [s]", [1.0, 2.0], False)
     figure = study_plots.accuracy_map(across, up, dict.fromkeys(NAMES, GRID), np.zeros((2, 2), bool), {})
     assert numbers_apart(figure.axes[2]) >= 2
+
+
+def test_the_legend_of_a_map_names_what_the_map_shows():
+    """An earlier version named lines outside of the map, drew at most three lines, and did not explain grey cells."""
+    axis = study_plots.MapAxis("delta [s]", [1.0, 2.0], True)
+    outside = {"outside": (np.array([3.0, 5.0]), np.array([1.0, 2.0])), "empty": (np.full(2, np.nan), np.ones(2))}
+    across = {f"line {k}": (np.array([0.1, 9.0]), np.array([1.0 + 0.1 * k, 2.0])) for k in range(5)}
+    grids: dict[str, np.ndarray] = dict.fromkeys(NAMES, np.where(np.eye(2), GRID, np.nan))
+    figure = study_plots.accuracy_map(axis, axis, grids, np.zeros((2, 2), bool), outside | across)
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == [*across, "no result"]
 
 
 def test_an_axis_of_whole_numbers_has_no_halves():
