@@ -196,7 +196,7 @@ def tradeoff(
     for (label, (errors, torques)), (colour, marker), above in looks:  # the first set is drawn above the others
         rms, mean = convert(np.sqrt(np.nanmean(errors**2))), np.nanmean(torques)
         axes.loglog(convert(errors), torques, marker, ms=2.5, alpha=0.35, color=colour, mew=0, zorder=2)
-        text = f"{label.replace('_', ' ')}: RMS {rms:.3g} {error_unit}, mean peak {mean:.3g} {unit}"
+        text = f"{label.replace('_', ' ')}: RMS {float(f'{rms:.3g}'):g} {error_unit}, mean peak {mean:.3g} {unit}"
         axes.loglog(rms, mean, marker, ms=9, color=colour, mec="white", label=text, zorder=2 + above)
     if limit is not None:
         axes.axhline(limit, **LIMIT, label=f"limit {limit:g} {unit}")
@@ -212,7 +212,7 @@ def tradeoff(
 
 def settling_by_angle(sets: Mapping[str, tuple[np.ndarray, np.ndarray]], t_f: float) -> Figure:
     """Plot settling time [s] against initial angle [deg]; `sets`: label -> (angles, times), NaN: never settles."""
-    figure, axes = new_figure("When it settles, by where it starts", "settling time [s]")
+    figure, axes = new_figure("Settling time by initial angle", "settling time [s]")
     for (label, (angle, time)), (colour, marker) in zip(sets.items(), _colours_and_markers(len(sets)), strict=True):
         settled, name = np.isfinite(time), label.replace("_", " ")
         name = name if np.all(settled) else f"{name}: {np.count_nonzero(~settled)} never"

@@ -269,7 +269,7 @@ def test_stability_limits_are_drawn_over_period_and_delta_only():
         lines["stability limit $\\delta = (\\eta - 1/2) h$, of explicit sampling only"][0], 2.5 * np.asarray(y.values)
     )
     delta, period = lines["stability limit with a period of delay"]
-    assert np.all(delta < mapping.stability_limit_curves(loaded, x, y)["the same with a period of delay"][0])
+    assert np.all(delta < mapping.stability_limit_curves(loaded, x, y)["stability limit with a period of delay"][0])
     assert not mapping.stability_limit_curves(loaded, x, mapping.parse_axis("controller.eta=3:4:2", "--y"))
     third = scenario.from_tables({"plant": {"kind": "chain", "order": 3}, "loop": {"mode": "sampled"}})
     assert not mapping.stability_limit_curves(third, x, y)  # the formula is for plants of order 2

@@ -283,7 +283,7 @@ def stability_limit_curves(scenario: Scenario, x: Axis, y: Axis) -> dict[str, tu
     formula = f"stability limit $\\delta = (\\eta - {3 if anchored else 1}/2) h$"
     # without delay, implicit sampling has no stability limit; the limit of explicit sampling is drawn instead
     label_without_delay = f"{formula}, of explicit sampling only" if implicit else formula
-    label_with_delay = "stability limit with {} of delay" if implicit else "the same with {} of delay"
+    label_with_delay = "stability limit with {} of delay"
     delays = {label_without_delay: 0.0, label_with_delay.format("a period"): 1.0}
     if delay > 1:
         delays[label_with_delay.format(f"{delay} periods")] = float(delay)
