@@ -88,8 +88,12 @@ def signals(t: np.ndarray, panels: list[tuple[str, np.ndarray, np.ndarray]]) -> 
             colour, _ = style.STYLES[k % len(style.STYLES)]
             panel.plot(t[drawn], measured[drawn, k], ".", ms=2, color=colour, alpha=0.4)
             panel.plot(t[drawn], predicted[drawn, k], "-", lw=0.9, color=colour, label=f"component {k + 1}")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower left", ncols=6)
+    _legend_below(figure)
     return figure
+
+
+def _legend_below(figure: Figure) -> None:
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower left", ncols=6)
 
 
 @style.styled
@@ -166,6 +170,8 @@ def profile(t: np.ndarray, panels: list[tuple[str, np.ndarray]]) -> Figure:
     """Draw a proposed manoeuvre over time; panels: label and values (rows, components) of each signal, t: in s."""
     figure, axes = _panels([label for label, _ in panels], "Proposed manoeuvre")
     for panel, (_, values) in zip(axes, panels, strict=True):
-        for column, (colour, line) in zip(values.T, style.STYLES, strict=False):
-            panel.plot(t, column, color=colour, ls=line)
+        for k, column in enumerate(values.T):
+            colour, line = style.STYLES[k % len(style.STYLES)]
+            panel.plot(t, column, color=colour, ls=line, label=f"component {k + 1}")
+    _legend_below(figure)
     return figure

@@ -13,3 +13,8 @@ def test_signals_show_every_component_and_a_legend_below_them():
     (axes,), (legend,) = figure.axes, figure.legends
     assert len(legend.get_texts()) == 7
     assert legend.get_window_extent().y1 < axes.get_window_extent().y0
+
+
+def test_a_proposed_manoeuvre_names_its_components():
+    figure = identification_plots.profile(np.arange(5.0), [("command [N m]", np.ones((5, 3)))])
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == [f"component {k}" for k in (1, 2, 3)]

@@ -12,6 +12,7 @@ from ptsmc_jax.identification.design import Design
 from ptsmc_jax.identification.estimation import Identification
 from ptsmc_jax.scenario import custom, parsing
 from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.simulation.catalogues import CATALOGUES
 from tuning.search import custom_parts
 
 
@@ -65,7 +66,8 @@ def write_design(
     if figures:
         from ptsmc_jax.figures import identification_plots, style
 
-        blocks = {"sent": "command", "measured_w": "rate [rad/s]", "measured_x": "state"}
+        unit = CATALOGUES[scenario.plant.kind]["peak_torque"].unit
+        blocks = {"sent": f"command [{unit}]", "measured_w": "rate [rad/s]", "measured_x": "state"}
         panels = [
             (label, frame.select(pl.col(f"^{name}\\d+$")).to_numpy()) for name, label in blocks.items()
             if f"{name}1" in frame.columns
