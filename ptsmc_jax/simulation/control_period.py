@@ -4,6 +4,7 @@ The sampled loop, the linearisation of `theory.linear` and the test vectors of t
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -55,9 +56,10 @@ class Record(NamedTuple):
     now: Ticks  # true times
     decision: Decision  # decision of the flight software; its target is the reference at the true time
     torques: Torques
-    x_at: Callable[[Scalar], Any]  # time in the interval [s] -> true state then
+    x_after: Callable[[Scalar], Any]  # time since the start [s] -> true state then
     step: Scalar  # longest integration step [s]
     drive: Drive | None = None  # input of the actuators in the period
+    tick: Tick | None = None  # nominal times; None in the continuous loop, and if sensors are simulated with exported C
 
 
 class Vehicle(NamedTuple):
@@ -76,20 +78,13 @@ class Vehicle(NamedTuple):
         matrix = jnp.where(tick.partial_before, self.first_matrix, self.matrix)
         return Period(tick.now, tick.dt_before, matrix, self.parts.period)
 
-    def draw_offset(self, t: Scalar, sample: Array) -> Array | None:
+    def draw_offset(self, t: Scalar, sample: Array) -> Array:
         """Return the random delay [s] of a sample after its nominal time t [s]; zero at both ends of the run."""
-        if self.jitter_key is None:
-            return None
         parts = self.parts
         assert parts.jitter is not None
+        assert self.jitter_key is not None
         largest = jnp.minimum(parts.jitter * parts.period, jnp.minimum(t, parts.t_end - t) / 2.0)
         return largest * (2.0 * draws.uniforms(self.jitter_key, 1, sample)[0] - 1.0)
-
-    def advance_walk(self, walk: Array | None, dt: Scalar, sample: Array) -> Array | None:
-        """Return the random walk of the disturbance, (m,) [N m], after one more step for a period of dt [s]."""
-        if walk is None or self.walk_key is None or self.parts.walk_rate is None:
-            return None
-        return walk + self.parts.walk_rate * dt * draws.normals(self.walk_key, walk.size, sample)
 
 
 def control_period(vehicle: Vehicle, state: State, tick: Tick) -> tuple[State, Record]:
@@ -107,8 +102,9 @@ def control_period(vehicle: Vehicle, state: State, tick: Tick) -> tuple[State, R
     period = vehicle.period(tick)
 
     # with timing jitter, samples come early or late; flight software assumes the nominal times of `period`
-    now, next_offset = period.now, vehicle.draw_offset(period.now.t_next, period.now.sample + 1)
-    if next_offset is not None and state.offset is not None:
+    now, next_offset = period.now, None
+    if state.offset is not None:
+        next_offset = vehicle.draw_offset(now.t_next, now.sample + 1)
         now = now._replace(t=now.t + state.offset, t_next=now.t_next + next_offset)
     dt = now.t_next - now.t
 
@@ -127,22 +123,27 @@ def control_period(vehicle: Vehicle, state: State, tick: Tick) -> tuple[State, R
     torques = period_torques(actuators, drive, decision.u, dt)
 
     # true plant: integrate under the torques and the disturbance
-    walk = vehicle.advance_walk(state.walk, dt, now.sample)
+    walk = state.walk
+    if walk is not None:
+        assert vehicle.walk_key is not None
+        assert parts.walk_rate is not None
+        walk = walk + parts.walk_rate * dt * draws.normals(vehicle.walk_key, walk.size, now.sample)
+    x_after = partial(state_after, parts, now.t, state.x, drive, walk)
     applied = None if actuators.is_exact_hold else actuators.assumed_torque(drive, period.length)
-    motion = PeriodMotion(parts, now.t, state.x, drive, walk)
     after = State(
-        x=motion.state_at(now.t_next),
+        x=x_after(dt),
         torque=jnp.where(now.t_next > now.t, torques.delivered[-1], state.torque),
         computer=computer._replace(applied=applied),
         actuators=actuators.end(state.actuators, drive, queue, dt),
         walk=walk,
-        star_x=star_state(parts, now, motion.state_at),
+        star_x=star_state(parts, now, x_after),
         offset=next_offset,
     )
     if next_offset is not None:
         decision = decision._replace(target=parts.reference(now.t))
-    x_at = motion._replace(rolled=True).state_at  # called only once in a run, so that speed does not matter
-    return after, Record(now, decision, torques, x_at, dt / parts.substeps, drive)
+    x_at_t_f = partial(x_after, rolled=True)  # called only once in a run, so that speed does not matter
+    nominal = None if vehicle.software.on_processor else tick
+    return after, Record(now, decision, torques, x_at_t_f, dt / parts.substeps, drive, nominal)
 
 
 def start(
@@ -174,8 +175,8 @@ def start(
         computer=computer._replace(applied=None) if actuators.is_exact_hold else computer,
         actuators=actuators.begin(inputs),
         walk=None if walk_key is None else jnp.zeros(inputs),
-        star_x=star_state(parts, first, lambda t: x0),
-        offset=vehicle.draw_offset(ticks.t[0], ticks.sample[0]),
+        star_x=star_state(parts, first, lambda dt: x0),
+        offset=None if jitter_key is None else vehicle.draw_offset(ticks.t[0], ticks.sample[0]),
     )
     return vehicle, state
 
@@ -192,43 +193,40 @@ def first_period(ticks: Ticks) -> Ticks:
     return jax.tree.map(lambda v: v[jnp.argmax(ticks.t_next > ticks.t)], ticks)
 
 
-class PeriodMotion(NamedTuple):
-    """The motion of the true plant in a control period, under the drive of its actuators and the disturbance."""
+def state_after(
+    parts: Parts, t: Scalar, x: Any, drive: Drive, walk: Array | None, dt: Scalar, *, rolled: bool = False
+) -> Any:
+    """Return the true state of the plant after a part of a control period.
 
-    parts: Parts
-    t: Scalar  # start of the period [s]
-    x: Any  # true state then
-    drive: Drive
-    walk: Array | None  # additional disturbance, constant over the period, (m,) [N m]; None: there is none
-    rolled: bool = False  # whether a loop computes the RK4 stages, which is slower but compiles faster
+    Args:
+        parts: parts of the run.
+        t: start of the period [s].
+        x: true state then.
+        drive: input of the actuators in the period.
+        walk: additional disturbance, constant over the period, (m,) [N m]; None: there is none.
+        dt: time since the start of the period [s].
+        rolled: whether a loop computes the RK4 stages, which is slower but compiles faster.
+    """
+    plant, step = parts.plant, dt / parts.substeps
 
-    def state_at(self, time: Scalar) -> Any:
-        """Return the state at a time [s] in the period."""
-        return self.state_after(time - self.t)
+    def substep(k: Scalar, x: Any) -> Any:
+        """Return the state after integration step k, which begins in the state x."""
+        start, applied = t + k * step, parts.actuators.torque_over(drive, k * step, step)
 
-    def state_after(self, dt: Scalar) -> Any:
-        """Return the true state at dt [s] after the start of the period."""
-        parts, drive, walk, actuators = self.parts, self.drive, self.walk, self.parts.actuators
-        step = dt / parts.substeps
+        def rate(time: Scalar, x_stage: Any) -> Any:
+            d = parts.disturbance(time, x_stage)
+            torque = applied.torque_at(time - start, plant.velocity(x_stage))
+            return plant.rate(time, x_stage, torque, d if walk is None else d + walk)
 
-        def substep(k: Scalar, x: Any) -> Any:
-            """Return the state after integration step k, which begins in the state x."""
-            start, applied = self.t + k * step, actuators.torque_over(drive, k * step, step)
+        return integrators.rk4(rate, start, x, step, rolled=rolled or plant.custom_functions)
 
-            def rate(time: Scalar, x_stage: Any) -> Any:
-                d = parts.disturbance(time, x_stage)
-                torque = applied.torque_at(time - start, parts.plant.velocity(x_stage))
-                return parts.plant.rate(time, x_stage, torque, d if walk is None else d + walk)
-
-            return integrators.rk4(rate, start, x, step, rolled=self.rolled or parts.plant.custom_functions)
-
-        if parts.substeps == 1:
-            return parts.plant.normalise(substep(jnp.zeros_like(dt), self.x))
-        starts = jnp.arange(parts.substeps, dtype=dt.dtype)
-        return parts.plant.normalise(jax.lax.scan(lambda x, k: (substep(k, x), None), self.x, starts)[0])
+    if parts.substeps == 1:
+        return plant.normalise(substep(jnp.zeros_like(dt), x))
+    starts = jnp.arange(parts.substeps, dtype=dt.dtype)
+    return plant.normalise(jax.lax.scan(lambda x, k: (substep(k, x), None), x, starts)[0])
 
 
-def star_state(parts: Parts, now: Ticks, x_at: Callable[[Scalar], Any]) -> Any:
+def star_state(parts: Parts, now: Ticks, x_after: Callable[[Scalar], Any]) -> Any:
     """Return the true states when sensors with their own sample times take readings in a period, or None.
 
     The flight software gets these readings at the next sample or later.
@@ -236,10 +234,10 @@ def star_state(parts: Parts, now: Ticks, x_at: Callable[[Scalar], Any]) -> Any:
     Args:
         parts: parts of the run.
         now: the period.
-        x_at: function from a time in the period [s] to the true state.
+        x_after: function from the time since the start of the period [s] to the true state.
     """
     ages = parts.sensors.newest_reading_age(now.sample + 1, now.t_next - now.t)
-    return jax.tree.map(lambda age: parts.plant.visible(x_at(now.t_next - age)), ages)
+    return jax.tree.map(lambda age: parts.plant.visible(x_after(now.t_next - age - now.t)), ages)
 
 
 def period_torques(actuators: Actuators, drive: Drive, u: Array, dt: Scalar) -> Torques:

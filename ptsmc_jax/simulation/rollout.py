@@ -4,7 +4,9 @@
 so other gains, inertias or noises reuse the compiled program. `simulate_parts` is the compiled function.
 """
 
-from typing import Any
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +22,7 @@ from ptsmc_jax.simulation import run_state
 from ptsmc_jax.simulation.assembly import Parts, check_parts
 from ptsmc_jax.simulation.clock import Graded
 from ptsmc_jax.simulation.computer import PYTHON_SOFTWARE, Computer, Decision, Software
-from ptsmc_jax.simulation.control_period import Record, State, Tick, control_period, schedule, start
+from ptsmc_jax.simulation.control_period import Record, State, control_period, schedule, start
 from ptsmc_jax.simulation.metrics import Criteria, Torques
 from ptsmc_jax.simulation.run_state import DIVERGED as DIVERGED
 from ptsmc_jax.simulation.run_state import FINISHED as FINISHED
@@ -71,47 +73,56 @@ def simulate(
         is_too_coarse = parts.clock.is_too_coarse(parts.controller.t_f, parts.controller.delta)
         uncovered_from = jnp.where(is_too_coarse, 0.0, uncovered_from)
     run = Run(parts, ticks, criteria, x0, target, target_t_f, unit, uncovered_from, record)
-    return _simulate_sampled(run, seed, trial, software) if parts.clock.sampled else _simulate_continuous(run)
+    loop = _sampled_loop(run, seed, trial, software) if parts.clock.sampled else _continuous_loop(run)
+
+    def step(carry: tuple[State, Score], interval: Any) -> tuple[tuple[State, Score], Log | None]:
+        state, score = carry
+        after, record = loop.step(state, interval)
+        row = run_state.history_row(run, state, after, record) if run.record else None
+        return (after, run_state.advance(run, score, state, after, record)), row
+
+    first = run_state.begin(run)
+    (state, score), rows = stacking.scan(step, (loop.start, first), loop.intervals)
+    log = None
+    if rows is not None:
+        log = run_state.history(jax.tree.map(lambda v: v[: run.ticks.t.size], rows), loop.last_row(state, rows))
+    samples = None if software.count_statuses is None else software.count_statuses(state.computer)
+    return run_state.finish(run, first, score, log, samples)
 
 
-def _simulate_sampled(run: Run, seed: WholeNumber, trial: WholeNumber, software: Software) -> Result:
-    """Return the result of a sampled run: control periods one after the other, with metrics and history."""
+class Loop(NamedTuple):
+    """The sampled or the continuous loop of a run."""
+
+    step: Callable[[State, Any], tuple[State, Record]]  # simulates one control period or integration step
+    start: State
+    intervals: Any  # control periods or integration steps, arrays (intervals,)
+    last_row: Callable[[State, Log], Log]  # last state and all rows -> row of the history at t_end
+
+
+def _sampled_loop(run: Run, seed: WholeNumber, trial: WholeNumber, software: Software) -> Loop:
+    """Return the loop of control periods."""
     ticks, t_end = run.ticks, run.criteria.t_end
     if run.record:  # the history ends with a sample at t_end, whose period has no length and changes no metric
         end = Ticks(t_end, t_end, jnp.asarray(True), ticks.sample[-1] + 1, jnp.ones_like(t_end), jnp.asarray(False))
         ticks = jax.tree.map(lambda column, value: jnp.append(column, value.astype(column.dtype)), ticks, end)
     vehicle, state = start(run.parts, ticks, run.x0, seed, trial, software)
 
-    def step(carry: tuple[State, Score], tick: Tick) -> tuple[tuple[State, Score], Log | None]:
-        state, score = carry
-        after, record = control_period(vehicle, state, tick)
-        measured_tick = None if software.on_processor else tick
-        row = run_state.history_row(run, state, after, record, measured_tick) if run.record else None
-        return (after, run_state.advance(run, score, state, after, record)), row
+    def last_row(state: State, rows: Log) -> Log:
+        """Return the row with the estimate and s of a sample at t_end, and the torque held until then."""
+        end_index = jnp.argmax(rows.t >= t_end)
+        decision = Decision(run.parts.reference(t_end), rows.d_hat[end_index], state.torque, rows.s[end_index])
+        wheels = None if state.actuators.h is None else (state.actuators.h, state.actuators.v)
+        row = run_state.history_row_at(
+            run, t_end, state.x, decision, state.torque, jnp.asarray(True), state.walk, wheels
+        )
+        readings, sent = jax.tree.map(lambda column: column[end_index], (rows.readings, rows.sent))
+        return row._replace(readings=readings, sent=sent)
 
-    first = run_state.begin(run)
-    (state, score), rows = stacking.scan(step, (state, first), schedule(ticks))
-    log = None
-    if rows is not None:
-        log = run_state.history(jax.tree.map(lambda v: v[:-1], rows), _last_row(run, state, rows))
-    samples = None if software.count_statuses is None else software.count_statuses(state.computer)
-    return run_state.finish(run, first, score, log, samples)
+    return Loop(partial(control_period, vehicle), state, schedule(ticks), last_row)
 
 
-def _last_row(run: Run, state: State, rows: Log) -> Log:
-    """Return the row at t_end: the estimate and s of a sample there, and the torque held until then."""
-    parts, t, x, torque = run.parts, run.criteria.t_end, state.x, state.torque
-    end_index = jnp.argmax(rows.t >= t)
-    d_hat, s = rows.d_hat[end_index], rows.s[end_index]
-    decision = Decision(parts.reference(t), d_hat, torque, s)
-    wheels = None if state.actuators.h is None else (state.actuators.h, state.actuators.v)
-    last = run_state.history_row_at(run, t, x, decision, torque, jnp.asarray(True), state.walk, wheels)
-    readings, sent = jax.tree.map(lambda column: column[end_index], (rows.readings, rows.sent))
-    return last._replace(readings=readings, sent=sent)
-
-
-def _simulate_continuous(run: Run) -> Result:
-    """Return the result of a continuous run.
+def _continuous_loop(run: Run) -> Loop:
+    """Return the loop of integration steps.
 
     Law and observer are integrated with the plant. The observer's linear part is exact (ETDRK4).
     """
@@ -124,9 +135,8 @@ def _simulate_continuous(run: Run) -> Result:
     largest_decay = jnp.max(jax.vmap(lambda a, dt: matrices.row_norm(a) * dt)(decay_matrices, lengths))
     decays = jax.vmap(lambda a, dt: integrators.decay(a, dt, largest_decay))(decay_matrices, lengths)
 
-    def step(carry: tuple[State, Score], tick: tuple) -> tuple[tuple[State, Score], Log | None]:
-        (now, decay), (state, score) = tick, carry
-        x, memory = state.x, state.computer.observer
+    def step(state: State, interval: tuple[Ticks, integrators.Decay]) -> tuple[State, Record]:
+        (now, decay), x, memory = interval, state.x, state.computer.observer
         dt, target = now.t_next - now.t, parts.reference(now.t)
 
         def rate(t: Scalar, x: Any, memory: Array) -> tuple[Any, Array, tuple[Array, Array]]:
@@ -142,25 +152,19 @@ def _simulate_continuous(run: Run) -> Result:
         u_nodes = u, u_end  # without the middle stage, whose torque oscillates from step to step in a thin layer
         torques = Torques(u_nodes, u_nodes, (1 / 2, 1 / 2), jnp.asarray(False), None)
         decision = Decision(target, observer.estimate(memory), u, s)
-        record = Record(now, decision, torques, lambda t: x_next, dt)
         torque = jnp.where(now.t_next > now.t, u_end, state.torque)
         after = State(x_next, torque, state.computer._replace(observer=memory_next))
-        row = run_state.history_row(run, state, after, record) if run.record else None
-        return (after, run_state.advance(run, score, state, after, record)), row
+        return after, Record(now, decision, torques, lambda time: x_next, dt)  # t_f is a node, so it ends a step
 
-    first = run_state.begin(run)
-    start_state = State(run.x0, jnp.zeros(parts.plant.inputs), Computer(None, None, observer.begin(), None, None))
-    (state, score), rows = stacking.scan(step, (start_state, first), (ticks, decays))
-    log = None
-    if rows is not None:
-        t = run.criteria.t_end
-        x, d_hat = state.x, observer.estimate(state.computer.observer)
+    def last_row(state: State, rows: Log) -> Log:
+        """Return the row with the estimate, the command and s at t_end."""
+        t, x, d_hat = run.criteria.t_end, state.x, observer.estimate(state.computer.observer)
         target, hold = parts.reference(t), t >= controller.hand_over
         u, s, _ = controller(Sample(t, hold, jnp.zeros_like(t)), x, target, d_hat, k2(t))
-        decision = Decision(target, d_hat, u, s)
-        last = run_state.history_row_at(run, t, x, decision, u, jnp.asarray(True))
-        log = run_state.history(rows, last)
-    return run_state.finish(run, first, score, log)
+        return run_state.history_row_at(run, t, x, Decision(target, d_hat, u, s), u, jnp.asarray(True))
+
+    computer = Computer(None, None, observer.begin(), None, None)
+    return Loop(step, State(run.x0, jnp.zeros(parts.plant.inputs), computer), (ticks, decays), last_row)
 
 
 def _check_fit(parts: Parts) -> None:

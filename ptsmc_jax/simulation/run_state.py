@@ -13,7 +13,7 @@ from ptsmc_jax.numerics.pytrees import Scalar, listing
 from ptsmc_jax.simulation import metrics, pointing
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.computer import Decision
-from ptsmc_jax.simulation.control_period import Record, State, Tick
+from ptsmc_jax.simulation.control_period import Record, State
 from ptsmc_jax.simulation.metrics import Arrival, Criteria, Errors, Interval, Snapshot, Start
 
 OK, DIVERGED, TOO_FAST, SINGULAR, NOT_CONVERGED, UNBOUNDED, INCOMPLETE = range(7)
@@ -123,7 +123,7 @@ def advance(run: Run, score: Score, before: State, after: State, record: Record)
         return Errors(*kinematics.errors(*at_start), *kinematics.errors(*at_end))
 
     def arrival() -> Arrival:
-        x = record.x_at(criteria.t_f)
+        x = record.x_after(criteria.t_f - now.t)
         return Arrival(kinematics.errors(x, run.target_t_f)[0], kinematics.angle(x, run.target_t_f))
 
     attitude_error = knowledge_error = None
@@ -141,18 +141,16 @@ def advance(run: Run, score: Score, before: State, after: State, record: Record)
     return _check_state(run, score, after.x, target_next, now.t_next, record.step, u_end, after.computer.law)
 
 
-def history_row(run: Run, before: State, after: State, record: Record, tick: Tick | None = None) -> Log:
-    """Return the history row at the start of a control period or step; without `tick` it has no sensor readings.
+def history_row(run: Run, before: State, after: State, record: Record) -> Log:
+    """Return the history row at the start of a control period or step; without `Record.tick` it has no sensor readings.
 
     Args:
         run: constants of the run.
         before: state at the start of the period.
         after: state at its end.
         record: record of the period.
-        tick: the period at its nominal times. It is None in the continuous loop, and with exported C, whose memory of
-            the sensors has another form.
     """
-    now, drive, decision, wheels = record.now, record.drive, record.decision, None
+    now, tick, drive, decision, wheels = record.now, record.tick, record.drive, record.decision, None
     if drive is not None and record.torques.wheel_torque is not None:
         wheels = drive.h, record.torques.wheel_torque[0]
     u, has_length = record.torques.delivered[0], now.t_next > now.t

@@ -36,7 +36,7 @@ from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation import clock
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.computer import Computer, Decision, Period, decide
-from ptsmc_jax.simulation.control_period import PeriodMotion, State, Tick, control_period, schedule, start
+from ptsmc_jax.simulation.control_period import State, Tick, control_period, schedule, start, state_after
 from ptsmc_jax.theory.carries import Carry, LocalCoordinates
 
 NODES = 0.5 - 0.5 * np.cos(np.pi * np.arange(13) / 12)  # Chebyshev nodes for delays within a period, in periods.
@@ -151,7 +151,7 @@ def _apply_commands(
         (x, actuator_state), (command, t, length) = state, entry
         sent = command if actuators.delay else actuators.send(actuator_state, command, w)[0]
         drive = actuators.drive(actuator_state, sent, t, length)
-        x = PeriodMotion(parts, t, x, drive, extra_torque).state_after(length)
+        x = state_after(parts, t, x, drive, extra_torque, length)
         return (x, actuators.end(actuator_state, drive, None, length)), None
 
     if len(commands) == 1:

@@ -22,8 +22,9 @@ Read `bound_along_run` first.
 """
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -36,7 +37,8 @@ from ptsmc_jax.batching import lapack
 from ptsmc_jax.devices.sensors import MeasurementModel
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.numerics import integrators, stacking
-from ptsmc_jax.simulation.control_period import PeriodMotion, star_state
+from ptsmc_jax.numerics.pytrees import Scalar
+from ptsmc_jax.simulation.control_period import star_state, state_after
 from ptsmc_jax.simulation.metrics import Criteria, integral_in_window
 from ptsmc_jax.simulation.rollout import Log, Parts
 
@@ -327,19 +329,19 @@ def _linearise_run(parts: Parts, log: Log, ticks: Ticks) -> _RunJacobians:
         dt, target, target_next = tick.t_next - tick.t, parts.reference(tick.t), parts.reference(tick.t_next)
         extra_torque = disturbance - parts.disturbance(tick.t, x)
 
-        def motion(x: Any, push: Array) -> PeriodMotion:
-            return PeriodMotion(parts, tick.t, x, drive, extra_torque + push)
+        def motion(x: Any, push: Array) -> Callable[[Scalar], Any]:
+            return partial(state_after, parts, tick.t, x, drive, extra_torque + push)
 
-        sampled = star_state(parts, tick, motion(x, jnp.zeros_like(extra_torque)).state_at)
+        sampled = star_state(parts, tick, motion(x, jnp.zeros_like(extra_torque)))
         change = getattr(parts.sensors, "change", None)
 
         def simulate_period(z: Float[Array, " n"], push: Float[Array, " m"]) -> tuple[Array, Array, Array, Array]:
             near = plant.retract(x, z)
             near_motion, early, now = motion(near, push), jnp.zeros(0), jnp.zeros(0)
-            near_next = near_motion.state_after(dt)
+            near_next = near_motion(dt)
             (start, rate), (end, rate_next) = kinematics.errors(near, target), kinematics.errors(near_next, target_next)
             middle = integrators.hermite_middle(start, rate, end, rate_next, dt)
-            near_sampled = star_state(parts, tick, near_motion.state_at)
+            near_sampled = star_state(parts, tick, near_motion)
             if change is not None:
                 seen, near_seen = plant.visible(x), plant.visible(near)
                 early, now = change(seen, near_seen, sampled, near_sampled), change(seen, near_seen)

@@ -97,7 +97,7 @@ def test_default_steps_keep_modes_accurate_to_a_millionth_for_given_torques(simu
         def period(x, now):
             t, t_next, u = now
             drive, _ = actuators.command(actuators.begin(3), u, x.w, t, t_next - t, jnp.ones(()))
-            x = control_period.PeriodMotion(made, t, x, drive, None).state_at(t_next)
+            x = control_period.state_after(made, t, x, drive, None, t_next - t)
             return x, x
 
         return jax.lax.scan(period, x, (t[:-1], t[1:], u[:-1]))[1]

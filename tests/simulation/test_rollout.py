@@ -271,13 +271,13 @@ def test_either_sign_of_the_quaternion_is_the_same_run():
 
 
 def test_other_numbers_use_the_same_compiled_program(monkeypatch):
-    traced, loop = [], rollout._simulate_sampled
+    traced, loop = [], rollout._sampled_loop
 
     def counted(*args):
         traced.append(args)
         return loop(*args)
 
-    monkeypatch.setattr(rollout, "_simulate_sampled", counted)
+    monkeypatch.setattr(rollout, "_sampled_loop", counted)
     for k in range(3):
         run = parts(20.0 - k, 3.0 + k, 0.5 + k, 10.0 * (1 + k), k1=1.0 + k, period=0.25, noise=(1e-5 * k, 1e-6))
         run = replace(run, clock=replace(TIGHT, period=vector(0.25 + 0.01 * k), t_end=vector(30.0 - k)))
