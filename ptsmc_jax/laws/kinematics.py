@@ -166,7 +166,7 @@ class AdditiveKinematics(AttitudeKinematics):
 
     def errors(self, x: AttitudeState, target: Target) -> tuple[Vector, Vector]:
         """Return eps_1 [-] and its time derivative [1/s] by (4), (3,) each."""
-        reference_rate, _ = target.vector_rates()
+        reference_rate, _ = attitude.vector_rates(*target)
         v_dot, _ = attitude.vector_rates(x.q, x.w, jnp.zeros(3))
         return x.q[:3] - target.q[:3], v_dot - reference_rate
 
@@ -176,7 +176,7 @@ class AdditiveKinematics(AttitudeKinematics):
 
     def invert(self, x: AttitudeState, target: Target, acceleration: Vector, d_hat: Vector) -> Vector:
         """Return the torque w x J w - d_hat + J T^-1 (2 eps_1'' + 2 q_1f'' - T' w) (3,) [N m], by (4)."""
-        _, reference_acceleration = target.vector_rates()
+        _, reference_acceleration = attitude.vector_rates(*target)  # q_1f''
         t_dot_w = -0.5 * jnp.dot(x.w, x.w) * x.q[:3]  # T'(q) w of (58)
         w_dot = attitude.t_inverse_times(x.q, 2.0 * acceleration + 2.0 * reference_acceleration - t_dot_w)
         return self.model.gyroscopic(x.w) - d_hat + self.model.inertia @ w_dot

@@ -31,10 +31,6 @@ class Target(NamedTuple):
     w: Array  # (3,) w_f, rate of the reference in reference axes [rad/s]
     w_dot: Array  # (3,) time derivative of w [rad/s^2]
 
-    def vector_rates(self) -> tuple[Array, Array]:
-        """Return q_1f' [1/s] and q_1f'' [1/s^2] of (57), (3,) each."""
-        return attitude.vector_rates(self.q, self.w, self.w_dot)
-
 
 def target_of(path: Callable[[Scalar], Float[Array, "4"]], t: Scalar) -> Target:
     """Return the target at t [s] of an attitude path, which is a unit quaternion as a function of time.

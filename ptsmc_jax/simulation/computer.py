@@ -58,6 +58,11 @@ class Period(NamedTuple):
         expected = jnp.where(self.now.partial, self.length, self.full_length)
         return jnp.where(self.length > 0.0, expected, 0.0)
 
+    def sample(self, memory: Any) -> Sample:
+        """Return the sample for the law with this memory. Its dt is never 0, so that the law can divide by it."""
+        dt = jnp.where(self.length > 0.0, self.assumed_length, self.full_length)
+        return Sample(self.now.t, self.now.hold, dt, memory)
+
 
 # statuses that exported C reports for a sample, the most severe last; other: not known to this version
 SAMPLE_STATUSES = ("ok", "saturated", "missed", "singular", "input", "overflow", "other")
@@ -96,17 +101,6 @@ def estimate(parts: Parts, period: Period, computer: Computer, seen: Any) -> tup
     return observer.estimate(memory), memory
 
 
-def command(
-    parts: Parts, k2: Bound, period: Period, computer: Computer, seen: Any, target: Any, d_hat: Array
-) -> tuple[Array, Array, Any]:
-    """Return the law's torque (m,) [N m], its sliding variable and its memory."""
-    now, has_length = period.now, period.length > 0.0
-    # a period without length gets the full length, so that the law can divide by it
-    length = jnp.where(has_length, period.assumed_length, period.full_length)
-    u, s, memory = parts.controller(Sample(now.t, now.hold, length, computer.law), seen, target, d_hat, k2(now.t))
-    return u, s, guards.select(has_length, memory, computer.law)
-
-
 def decide(
     parts: Parts,
     k2: Bound,
@@ -133,8 +127,8 @@ def decide(
     target = parts.reference(period.now.t)
     seen, sensors = parts.sensors.measure(computer.sensors, x, period.now, period.dt_before, star_x)
     d_hat, observer = estimate(parts, period, computer, seen)
-    u, s, law = command(parts, k2, period, computer, seen, target, d_hat)
-    command_filter = computer.command_filter
+    u, s, law = parts.controller(period.sample(computer.law), seen, target, d_hat, k2(period.now.t))
+    law, command_filter = guards.select(period.length > 0.0, law, computer.law), computer.command_filter
     if parts.command_filter is not None:
         u, command_filter = parts.command_filter.step(command_filter, u, period.dt_before, period.assumed_length)
         command_filter = guards.select(period.length > 0.0, command_filter, computer.command_filter)

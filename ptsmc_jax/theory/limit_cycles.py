@@ -133,13 +133,14 @@ def _nonlinear_residual(parts: Parts, run: linear.NominalRun) -> tuple[Array, Ar
     def residual_in_period(period: computer.Period, before: computer.Computer, seen: Any) -> tuple[Array, Array]:
         target = parts.reference(period.now.t)
         d_hat, _ = computer.estimate(parts, period, before, seen)
+        sample = period.sample(before.law)
 
         def error_derivatives(z: Array) -> Array:
             """Return eps and its derivatives at local coordinates z of the measured state."""
             return kinematics.derivatives(model.retract(seen, z), target).reshape(-1)
 
         def command(z: Array) -> Array:
-            return computer.command(parts, k2, period, before, model.retract(seen, z), target, d_hat)[0]
+            return parts.controller(sample, model.retract(seen, z), target, d_hat, k2(sample.t))[0]
 
         zero = jnp.zeros(model.local_coordinates(seen, seen).size)
         # LAPACK, because `matrices.solve` of six equations takes longer to compile than everything else here

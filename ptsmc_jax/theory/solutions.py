@@ -208,7 +208,7 @@ def plant_motion(kinematics: Kinematics, target: Any, start: Any, errors: Errors
 def _(kinematics: AdditiveKinematics, target: Any, start: Any, errors: Errors) -> Motion:
     # q4^2 = 1 - |v|^2 is the distance to the singularity; at or below 0 the path leaves the unit ball
     error, error_rate, acceleration = errors
-    rate_f, acceleration_f = target.vector_rates()
+    rate_f, acceleration_f = attitude.vector_rates(*target)
     q, square = attitude.from_vector_part(target.q[:3] + error, target.q[3])
     w = 2.0 * attitude.t_inverse_times(q, rate_f + error_rate)
     turning = 2.0 * (acceleration_f + acceleration) + 0.5 * jnp.dot(w, w) * q[:3]
