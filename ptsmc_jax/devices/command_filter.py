@@ -7,10 +7,10 @@ the filtered command. Vectors are (m,) in [N m]. Read `CommandFilter.step` first
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from ptsmc_jax import declare
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
@@ -39,7 +39,7 @@ class CommandFilter(declare.Tunable):
         """Return the delay of the filter at low frequencies, the derivative of its phase [s]."""
         raise NotImplementedError
 
-    def begin(self, inputs: int) -> Any:
+    def begin(self, inputs: int) -> PyTree:
         """Return the state at rest."""
         raise NotImplementedError
 
@@ -47,7 +47,7 @@ class CommandFilter(declare.Tunable):
         """Return g = tan(W dt / 2) [-] for a period dt [s]; W dt must be below pi."""
         return jnp.tan(0.5 * self.corner * dt)
 
-    def step(self, state: Any, u: Vector, dt_before: Scalar, dt: Scalar) -> tuple[Vector, Any]:
+    def step(self, state: PyTree, u: Vector, dt_before: Scalar, dt: Scalar) -> tuple[Vector, PyTree]:
         """Return the filtered command (m,) [N m] of a sample, and the state for the next sample.
 
         Args:

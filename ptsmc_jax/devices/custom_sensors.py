@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from ptsmc_jax import declare
 from ptsmc_jax.devices.sensors import Sensor
@@ -31,11 +31,13 @@ class SampledSensor(declare.Tunable):
     draws: ClassVar[int] = 0
     model: Any  # design model of the plant, as law and observer know it
 
-    def begin(self, x: Any) -> Any:
+    def begin(self, x: PyTree) -> PyTree:
         """Return the memory before the first sample; x: true state at the first sample."""
         return None
 
-    def see(self, memory: Any, x: Any, noise: Float[Array, " draws"], t: Scalar, dt: Scalar) -> tuple[Any, Any]:
+    def see(
+        self, memory: PyTree, x: PyTree, noise: Float[Array, " draws"], t: Scalar, dt: Scalar
+    ) -> tuple[PyTree, PyTree]:
         """Return the measured state and the new memory.
 
         Args:
@@ -56,19 +58,19 @@ class SampledSensor(declare.Tunable):
 class CustomSensors(Sensor):
     """Adapter of custom sensors to the `Sensor` interface. The noise depends on (seed, trial, sample)."""
 
-    custom: Any  # `SampledSensor`
+    custom: SampledSensor
     noise_scale: Leaf  # factor of the noise: 1, or 0 for no noise [-]
 
     def noise(self, key: draws.Key, sample: Int[Array, ""]) -> Float[Array, " draws"]:
         """Return the noise of one sample, (draws,) [-]."""
         return self.noise_scale * draws.normals(key, self.custom.draws, sample) if self.custom.draws else jnp.zeros(0)
 
-    def begin(self, seed: WholeNumber, trial: WholeNumber, x0: Any, now: Ticks) -> tuple:
+    def begin(self, seed: WholeNumber, trial: WholeNumber, x0: PyTree, now: Ticks) -> tuple:
         """Return the memory before the first sample; see `Sensor.begin`."""
         key = draws.stream(seed, trial, CUSTOM_NOISE)
         return key, self.noise(key, now.sample), self.custom.begin(x0)
 
-    def measure(self, memory: tuple, x: Any, now: Ticks, dt: Scalar, star_x: None = None) -> tuple[Any, tuple]:
+    def measure(self, memory: tuple, x: PyTree, now: Ticks, dt: Scalar, star_x: None = None) -> tuple[PyTree, tuple]:
         """Return the measured state and the memory. A period of length 0 does not change the memory."""
         key, noise, sensor_memory = memory
         noise_next = self.noise(key, now.sample + 1)

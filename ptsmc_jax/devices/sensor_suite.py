@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from ptsmc_jax.devices.attitude_sensors import AttitudeSensor, StarTracker
 from ptsmc_jax.devices.kalman_filter import KalmanFilter, Track
@@ -64,7 +64,7 @@ class SensorSuite(SpacecraftSensors):
         """Return the number of control periods after which the sample times repeat, for means in linear theory."""
         return int(np.lcm.reduce([sensor.times.every or 1 for sensor in self.sensors]))
 
-    def newest_reading_age(self, sample: Array, dt: Scalar) -> Any:
+    def newest_reading_age(self, sample: Array, dt: Scalar) -> PyTree:
         """Return the age [s] of the newest reading of each sensor with its own clock, None for others; see `Sensor`."""
         if not self.filter.has_readings_between_samples:
             return None
@@ -90,7 +90,7 @@ class SensorSuite(SpacecraftSensors):
         return SuiteMemory(keys, self.noise(keys, now.sample), bias, tuple(waiting), estimate)
 
     def readings(
-        self, memory: SuiteMemory, x: AttitudeState, now: Ticks, dt: Scalar, star_x: Any = None
+        self, memory: SuiteMemory, x: AttitudeState, now: Ticks, dt: Scalar, star_x: PyTree = None
     ) -> tuple[list[tuple[Array, Scalar, Array]], Array, SuiteMemory]:
         """Return the readings at a sample, and the memory; see `Sensor.measure` for the arguments.
 
@@ -116,7 +116,7 @@ class SensorSuite(SpacecraftSensors):
         return delivered, rate, memory._replace(noise=noise_next, bias=bias, waiting=tuple(waiting))
 
     def inputs(
-        self, memory: SuiteMemory, x: AttitudeState, now: Ticks, dt: Scalar, star_x: Any = None
+        self, memory: SuiteMemory, x: AttitudeState, now: Ticks, dt: Scalar, star_x: PyTree = None
     ) -> tuple[dict[str, Array], SuiteMemory]:
         """Return the inputs of exported C at a sample, by name, and the memory; see `Sensor.inputs`."""
         delivered, rate, memory = self.readings(memory, x, now, dt, star_x)
@@ -135,7 +135,7 @@ class SensorSuite(SpacecraftSensors):
         return named | {name: value for name, value in past.items() if value is not None}
 
     def measure(
-        self, memory: SuiteMemory, x: AttitudeState, now: Ticks, dt: Scalar, star_x: Any = None
+        self, memory: SuiteMemory, x: AttitudeState, now: Ticks, dt: Scalar, star_x: PyTree = None
     ) -> tuple[AttitudeState, SuiteMemory]:
         """Return the attitude and rate that the filter estimates, and the memory."""
         delivered, rate, memory_next = self.readings(memory, x, now, dt, star_x)
@@ -168,7 +168,7 @@ class SensorSuite(SpacecraftSensors):
         start = ATTITUDE_AND_BIAS, np.asarray(self.filter.first_factor(sample, fraction))
         return MeasurementModel(rows, noise, np.asarray(self.rate_bias), np.asarray(self.bias_rate), start, early)
 
-    def change(self, x: AttitudeState, near: AttitudeState, taken: Any = None, near_taken: Any = None) -> Array:
+    def change(self, x: AttitudeState, near: AttitudeState, taken: PyTree = None, near_taken: PyTree = None) -> Array:
         """Return the differences of all readings (m,) between two true states.
 
         Args:

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from ptsmc_jax.devices.attitude_filter import AttitudeFilter, Estimate, attitude_filter, filter_between_samples
 from ptsmc_jax.devices.attitude_sensors import SampleTimes
@@ -40,7 +40,7 @@ class Sensor(ABC):
     perfect: ClassVar[bool] = False  # whether the law gets the true state instead of a measured one
 
     @abstractmethod
-    def begin(self, seed: WholeNumber, trial: WholeNumber, x0: Any, now: Ticks) -> Any:
+    def begin(self, seed: WholeNumber, trial: WholeNumber, x0: PyTree, now: Ticks) -> PyTree:
         """Return the memory before the first sample of positive length [s].
 
         Args:
@@ -51,7 +51,9 @@ class Sensor(ABC):
         """
 
     @abstractmethod
-    def measure(self, memory: Any, x: Any, now: Ticks, dt: Scalar, star_x: Any = None) -> tuple[Any, Any]:
+    def measure(
+        self, memory: PyTree, x: PyTree, now: Ticks, dt: Scalar, star_x: PyTree = None
+    ) -> tuple[PyTree, PyTree]:
         """Return the measured state for the law, and the memory.
 
         Args:
@@ -62,11 +64,13 @@ class Sensor(ABC):
             star_x: true state at the time of `newest_reading_age`, for sensors with their own clock; None without them.
         """
 
-    def sample(self, memory: Any, x: Any, now: Ticks, dt: Scalar, star_x: Any = None) -> tuple[Any, Any]:
+    def sample(self, memory: PyTree, x: PyTree, now: Ticks, dt: Scalar, star_x: PyTree = None) -> tuple[PyTree, PyTree]:
         """Return the readings before any filter, and the memory; see `measure` for the arguments, dt in [s]."""
         return self.measure(memory, x, now, dt)
 
-    def inputs(self, memory: Any, x: Any, now: Ticks, dt: Scalar, star_x: Any = None) -> tuple[dict[str, Array], Any]:
+    def inputs(
+        self, memory: PyTree, x: PyTree, now: Ticks, dt: Scalar, star_x: PyTree = None
+    ) -> tuple[dict[str, Array], PyTree]:
         """Return the sensor inputs of exported C at a sample, by name, and the memory.
 
         See `measure` for the arguments.
@@ -75,19 +79,19 @@ class Sensor(ABC):
         named = {"attitude": read.q, "rate": read.w} if isinstance(read, AttitudeState) else {"x": read}
         return named, memory
 
-    def filter_state(self, memory: Any) -> dict[str, Array]:
+    def filter_state(self, memory: PyTree) -> dict[str, Array]:
         """Return the filter estimates that are part of the state of exported C, by name."""
         return {}
 
     @abstractmethod
-    def without_noise(self) -> Any:
+    def without_noise(self) -> "Sensor":
         """Return the sensor without noise."""
 
-    def at_control_samples(self) -> Any:
+    def at_control_samples(self) -> "Sensor":
         """Return an equivalent sensor with all samples at control samples, for linear theory; see `Sensors`."""
         return self
 
-    def newest_reading_age(self, sample: Array, dt: Scalar) -> Any:
+    def newest_reading_age(self, sample: Array, dt: Scalar) -> PyTree:
         """Return the ages [s] of the newest readings of sensors with their own clock at a control sample.
 
         Args:
@@ -112,10 +116,10 @@ class PerfectSensors(Sensor):
 
     perfect: ClassVar[bool] = True
 
-    def begin(self, seed: WholeNumber, trial: WholeNumber, x0: Any, now: Ticks) -> None:
+    def begin(self, seed: WholeNumber, trial: WholeNumber, x0: PyTree, now: Ticks) -> None:
         """Return None, because there is no memory."""
 
-    def measure(self, memory: None, x: Any, now: Ticks, dt: Scalar, star_x: None = None) -> tuple[Any, None]:
+    def measure(self, memory: None, x: PyTree, now: Ticks, dt: Scalar, star_x: None = None) -> tuple[PyTree, None]:
         """Return the true state; dt in [s]."""
         return x, None
 

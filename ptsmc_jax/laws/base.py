@@ -10,11 +10,12 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, PyTree
 
 from ptsmc_jax import declare
 from ptsmc_jax.laws.kinematics import Kinematics
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector
+from ptsmc_jax.plants.base import Plant
 
 
 def boundary_layer(default: Any, unit: str = "") -> Any:
@@ -34,7 +35,7 @@ class Sample(NamedTuple):
     t: Scalar  # [s]
     hold: Bool[Array, ""]  # whether the sample is in the hold phase, at or after the hand-over
     dt: Scalar  # length of the control period that begins here; the input is constant in it [s]
-    memory: Any = None  # memory of the law from the previous sample; at the first sample from `Law.begin`
+    memory: PyTree = None  # memory of the law from the previous sample; at the first sample from `Law.begin`
 
 
 class Law(declare.Tunable):
@@ -55,7 +56,7 @@ class Law(declare.Tunable):
     switches: ClassVar[bool] = True  # whether its switching term uses the bound on the estimation error
 
     @property
-    def model(self) -> Any:
+    def model(self) -> Plant:
         """Design model of the plant."""
         return self.kinematics.model
 
@@ -74,11 +75,11 @@ class Law(declare.Tunable):
         """Whether the continuous loop can simulate the law, which needs no memory and no `Sample.dt`."""
         return False
 
-    def begin(self) -> Any:
+    def begin(self) -> PyTree:
         """Return the memory of the law before its first sample, a pytree of arrays, or None for a law without it."""
         return None
 
-    def acceleration(self, now: Sample, error: Vector, error_rate: Vector, bound: Scalar) -> tuple[Any, ...]:
+    def acceleration(self, now: Sample, error: Vector, error_rate: Vector, bound: Scalar) -> tuple[PyTree, ...]:
         """Return the commanded acceleration a, and the sliding variable. The error obeys eps'' = a + d.
 
         Args:
@@ -93,7 +94,9 @@ class Law(declare.Tunable):
         """
         raise NotImplementedError
 
-    def __call__(self, now: Sample, x: Any, target: Any, d_hat: Vector, k2: Scalar) -> tuple[Vector, Vector, Any]:
+    def __call__(
+        self, now: Sample, x: PyTree, target: PyTree, d_hat: Vector, k2: Scalar
+    ) -> tuple[Vector, Vector, PyTree]:
         """Return the input for a measured state.
 
         Args:
@@ -112,7 +115,7 @@ class Law(declare.Tunable):
         u = self.kinematics.invert(x, target, acceleration, d_hat)
         return u, s, memory[0] if memory else now.memory
 
-    def singularity_distance(self, x: Any, target: Any) -> Scalar:
+    def singularity_distance(self, x: PyTree, target: PyTree) -> Scalar:
         """Return the signed distance to the singularity of the kinematics; 1 if the law does not invert them."""
         if type(self).__call__ is not Law.__call__:
             return jnp.ones(())

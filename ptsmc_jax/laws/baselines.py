@@ -78,7 +78,7 @@ class QuaternionPD(PD):
         """
         q_e, w_e, feedforward = self.kinematics.relative(x, target)
         w_dot = feedforward - self.k_p * q_e[:3] - self.k_d * w_e
-        u = self.model.gyroscopic(x.w) - d_hat + self.model.inertia @ w_dot
+        u = self.kinematics.model.gyroscopic(x.w) - d_hat + self.kinematics.model.inertia @ w_dot
         return u, q_e[:3] + self.k_d / self.k_p * w_e, None
 
 

@@ -10,10 +10,11 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from ptsmc_jax.numerics import attitude, guards, integrators, matrices
 from ptsmc_jax.numerics.pytrees import Function, Scalar, Vector, is_function, pytree
+from ptsmc_jax.plants.base import Plant
 from ptsmc_jax.plants.integrator_chain import Chain
 from ptsmc_jax.plants.rigid_body import AttitudeState, Spacecraft
 from ptsmc_jax.plants.second_order import System
@@ -31,7 +32,7 @@ class Kinematics:
     T(q) in (57) or dF/dx2 G in (29) has no inverse.
     """
 
-    model: Any  # design model of the plant
+    model: Plant  # design model
     # whether the error is q_1 - q_1f, as in the paper, which is singular at body attitudes of 180 deg
     additive: ClassVar[bool] = False
     symbol: ClassVar[str] = "$|x_1|$"  # symbol of the error's norm in figures
@@ -48,11 +49,11 @@ class Kinematics:
         """Return a reference, a pytree, from a function of time. A reference is returned unchanged."""
         return Function(function) if is_function(function) else function
 
-    def align(self, x: Any, target: Any) -> Any:
+    def align(self, x: PyTree, target: PyTree) -> PyTree:
         """Return the same initial state in the representation that the law needs, such as the other sign of q."""
         return x
 
-    def singularity_distance(self, x: Any, target: Any) -> Scalar:
+    def singularity_distance(self, x: PyTree, target: PyTree) -> Scalar:
         """Return the signed distance to the singularity: 0 on it, and 1 everywhere if there is none."""
         return jnp.ones(())
 
@@ -64,19 +65,19 @@ class Kinematics:
         """
         return jnp.where(first < 0.0, -1.0, 1.0)
 
-    def errors(self, x: Any, target: Any) -> tuple[Vector, Vector]:
+    def errors(self, x: PyTree, target: PyTree) -> tuple[Vector, Vector]:
         """Return the error eps and its time derivative [1/s], (m,) each."""
         raise NotImplementedError
 
-    def derivatives(self, x: Any, target: Any) -> Float[Array, "m n"]:
+    def derivatives(self, x: PyTree, target: PyTree) -> Float[Array, "m n"]:
         """Return the error and its time derivatives up to order n - 1, (m, n)."""
         return jnp.stack(self.errors(x, target), axis=1)
 
-    def angle(self, x: Any, target: Any) -> Scalar:
+    def angle(self, x: PyTree, target: PyTree) -> Scalar:
         """Return the size of the error: the angle to the reference [rad], or |x_1| for other plants in their unit."""
         raise NotImplementedError
 
-    def middle_angle(self, start: tuple[Any, Any], end: tuple[Any, Any], dt: Scalar) -> Scalar:
+    def middle_angle(self, start: tuple[PyTree, PyTree], end: tuple[PyTree, PyTree], dt: Scalar) -> Scalar:
         """Return `angle` in the middle of an interval, from the cubic Hermite polynomial of the error.
 
         Args:
@@ -86,11 +87,11 @@ class Kinematics:
         """
         return guards.norm(integrators.hermite_middle(*self.errors(*start), *self.errors(*end), dt))
 
-    def influence(self, x: Any, target: Any) -> Scalar:
+    def influence(self, x: PyTree, target: PyTree) -> Scalar:
         """Return the largest change of eps'' for a disturbance of norm 1, half of the paper's factor |T J^-1|."""
         raise NotImplementedError
 
-    def invert(self, x: Any, target: Any, acceleration: Vector, d_hat: Vector) -> Vector:
+    def invert(self, x: PyTree, target: PyTree, acceleration: Vector, d_hat: Vector) -> Vector:
         """Return the input (m,) that makes eps'' equal to a commanded acceleration.
 
         Args:
@@ -128,7 +129,7 @@ class AttitudeKinematics(Kinematics):
         """Return the angle between the attitude and the reference [rad]."""
         return attitude.angle(x.q, target.q)
 
-    def middle_angle(self, start: tuple[Any, Any], end: tuple[Any, Any], dt: Scalar) -> Scalar:
+    def middle_angle(self, start: tuple[PyTree, PyTree], end: tuple[PyTree, PyTree], dt: Scalar) -> Scalar:
         """Return `angle` in the middle [rad], from the cubic Hermite polynomial of q_f* q; smooth at angle 0."""
 
         def error_quaternion_and_rate(x: AttitudeState, target: Target) -> tuple[Array, Array]:
@@ -301,21 +302,21 @@ class ChainKinematics(Kinematics):
         """Order n of the chain."""
         return self.model.order
 
-    def errors(self, x: State, target: Any) -> tuple[Float[Array, "1"], Float[Array, "1"]]:
+    def errors(self, x: State, target: PyTree) -> tuple[Float[Array, "1"], Float[Array, "1"]]:
         """Return x_1 and x_2, (1,) each."""
         return x[:1], x[1:2]
 
-    def derivatives(self, x: State, target: Any) -> Float[Array, "1 n"]:
+    def derivatives(self, x: State, target: PyTree) -> Float[Array, "1 n"]:
         """Return the state, x_1 and its time derivatives, as a row (1, n)."""
         return x[None]
 
-    def angle(self, x: State, target: Any) -> Scalar:
+    def angle(self, x: State, target: PyTree) -> Scalar:
         """Return |x_1|."""
         return jnp.abs(x[0])
 
-    def influence(self, x: State, target: Any) -> Scalar:
+    def influence(self, x: State, target: PyTree) -> Scalar:
         return jnp.ones(())
 
-    def invert(self, x: State, target: Any, acceleration: Vector, d_hat: Vector) -> Vector:
+    def invert(self, x: State, target: PyTree, acceleration: Vector, d_hat: Vector) -> Vector:
         """Return the input (x_n' - f(x) - d_hat) / g(x) (1,) for a commanded x_n', the n-th derivative of x_1."""
         return (acceleration - self.model.drift(x) - d_hat) / self.model.input_gain(x)

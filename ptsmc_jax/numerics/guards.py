@@ -4,13 +4,15 @@
 finite everywhere. `time_tolerance` is the tolerance for comparisons of times.
 """
 
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ptsmc_jax.numerics.pytrees import Scalar
+
+Tree = TypeVar("Tree")  # a pytree of arrays
 
 
 @jax.jit
@@ -65,7 +67,7 @@ def signed_power(x: Float[Array, "..."], power: Scalar) -> Float[Array, "..."]:
     return jnp.where(at_zero, 0.0, jnp.sign(x) * size**power)
 
 
-def lerp(weight: Scalar, a: Any, b: Any) -> Any:
+def lerp(weight: Scalar, a: Tree, b: Tree) -> Tree:
     """Interpolate linearly between two pytrees.
 
     Args:
@@ -76,7 +78,7 @@ def lerp(weight: Scalar, a: Any, b: Any) -> Any:
     return jax.tree.map(lambda x, y: y + weight * (x - y), a, b)
 
 
-def select(condition: Array, a: Any, b: Any) -> Any:
+def select(condition: Array, a: Tree, b: Tree) -> Tree:
     """Return one of two pytrees. The other one has no influence on tangents.
 
     Args:

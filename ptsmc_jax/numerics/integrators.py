@@ -7,7 +7,7 @@ part. `phi_functions` are the matrix functions that `etdrk4` needs.
 from collections.abc import Callable
 from functools import partial
 from math import factorial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -16,8 +16,10 @@ from jaxtyping import Array, Float
 from ptsmc_jax.numerics.matrices import row_norm
 from ptsmc_jax.numerics.pytrees import Scalar
 
+State = TypeVar("State")  # a pytree of arrays
 
-def rk4(rate: Callable[[Scalar, Any], Any], t: Scalar, y: Any, dt: Scalar, *, rolled: bool = False) -> Any:
+
+def rk4(rate: Callable[[Scalar, State], State], t: Scalar, y: State, dt: Scalar, *, rolled: bool = False) -> State:
     """Return the state at t + dt by one step of the classical Runge-Kutta method of order 4.
 
     Args:
@@ -34,7 +36,7 @@ def rk4(rate: Callable[[Scalar, Any], Any], t: Scalar, y: Any, dt: Scalar, *, ro
         k4 = rate(t + dt, _add_scaled(y, k3, dt))
         return _simpson(y, dt, k1, k2, k3, k4)
 
-    def stage(k: Array | int, previous_and_total: tuple[Any, Any]) -> tuple[Any, Any]:
+    def stage(k: Array | int, previous_and_total: tuple[State, State]) -> tuple[State, State]:
         """Return the rate of stage k, and the weighted sum of the rates of the stages 0 to k."""
         previous, total = previous_and_total
         offset = dt * jnp.where(k == 0, 0.0, jnp.where(k == 3, 1.0, 0.5))
@@ -47,12 +49,12 @@ def rk4(rate: Callable[[Scalar, Any], Any], t: Scalar, y: Any, dt: Scalar, *, ro
     return _add_scaled(y, total, dt / 6)
 
 
-def _add_scaled(y: Any, rate: Any, step: Scalar) -> Any:
+def _add_scaled(y: State, rate: State, step: Scalar) -> State:
     """Return the pytree y + step rate."""
     return jax.tree.map(lambda y, k: y + step * k, y, rate)
 
 
-def _simpson(y: Any, dt: Scalar, k1: Any, k2: Any, k3: Any, k4: Any) -> Any:
+def _simpson(y: State, dt: Scalar, k1: State, k2: State, k3: State, k4: State) -> State:
     """Return the pytree y + dt (k1 + 2 k2 + 2 k3 + k4) / 6."""
     return jax.tree.map(lambda y, a, b, c, d: y + dt / 6 * (a + 2 * (b + c) + d), y, k1, k2, k3, k4)
 
@@ -107,7 +109,7 @@ def phi_functions(x: Float[Array, "n n"], order: int, largest: Scalar | None = N
     for k in range(order - 1, -1, -1):
         phi.insert(0, identity / factorial(k) + small @ phi[0])
 
-    def step(k: Any, phi: list[Array]) -> list[Array]:
+    def step(k: Array | int, phi: list[Array]) -> list[Array]:
         return jax.lax.cond(k < doublings, _double, lambda phi: phi, phi)
 
     # The loops have a fixed length, because reverse-mode differentiation requires it.

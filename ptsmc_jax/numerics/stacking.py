@@ -1,15 +1,21 @@
 """A `lax.scan` for loops that record many arrays in each step, such as a simulation with its history."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array
+
+# pytrees of arrays
+Carry = TypeVar("Carry")
+X = TypeVar("X")
+Y = TypeVar("Y")
 
 
-def scan(step: Callable[[Any, Any], tuple[Any, Any]], init: Any, xs: Any, **options: Any) -> tuple[Any, Any]:
+def scan(step: Callable[[Carry, X], tuple[Carry, Y]], init: Carry, xs: X, **options: Any) -> tuple[Carry, Y]:
     """Run `jax.lax.scan` with all outputs of a step concatenated into one row for each dtype.
 
     XLA usually updates the output arrays of a loop in place. But if one fusion writes several output arrays, XLA copies
@@ -29,7 +35,7 @@ def scan(step: Callable[[Any, Any], tuple[Any, Any]], init: Any, xs: Any, **opti
         return lax.scan(step, init, xs, **options)
     recorded: list[Any] = []  # tracing a step writes the structure of its outputs and their abstract values here
 
-    def step_packed(carry: Any, x: Any) -> tuple[Any, dict[str, Any]]:
+    def step_packed(carry: Carry, x: X) -> tuple[Carry, dict[str, Array]]:
         carry, y = step(carry, x)
         leaves, structure = jax.tree.flatten(jax.tree.map(jnp.asarray, y))
         recorded[:] = structure, [jax.typeof(leaf) for leaf in leaves]  # no tracers, which must not leave the trace

@@ -9,10 +9,10 @@ each control period from the integral of d_eff.
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
+from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from ptsmc_jax import declare
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, Vector, pytree
@@ -130,7 +130,7 @@ class SampledObserver(Observer):
 
     disturbance_bound: Leaf  # K of Assumption 1, bound on each component of d [N m]
 
-    def step(self, memory: Any, d_mean: Vector, t: Scalar, dt: Scalar) -> Any:
+    def step(self, memory: PyTree, d_mean: Vector, t: Scalar, dt: Scalar) -> PyTree:
         """Return the memory at the end of a control period.
 
         Args:
@@ -145,7 +145,7 @@ class SampledObserver(Observer):
         """Return K2; by default sqrt(m) K, the bound without an observer."""
         return constant_bound(self.disturbance_bound, self.model.inputs)
 
-    def update(self, matrix: Matrix, memory: Any, impulse: Vector, t: Scalar, dt: Scalar) -> Any:
+    def update(self, matrix: Matrix, memory: PyTree, impulse: Vector, t: Scalar, dt: Scalar) -> PyTree:
         """Call `step` with the mean disturbance impulse / dt [N m]."""
         length = jnp.where(dt > 0.0, dt, 1.0)
         return self.step(memory, impulse / length, t, length)

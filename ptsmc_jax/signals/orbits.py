@@ -8,6 +8,7 @@ start JAX.
 """
 
 from dataclasses import dataclass, field
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -73,7 +74,7 @@ class Orbit:
         """Return the largest angular rate of the radius vector, at perigee [rad/s]."""
         return self.rate() * (1.0 + self.eccentricity) ** 0.5 / (1.0 - self.eccentricity) ** 1.5
 
-    def anomalies(self, t: Any, xp: Any = jnp) -> tuple[Any, Any]:
+    def anomalies(self, t: Any, xp: ModuleType = jnp) -> tuple[Any, Any]:
         """Return the true and the eccentric anomaly (..,) [rad] at times (..,) [s].
 
         The eccentric anomaly E solves Kepler's equation M = E - e sin E. With b = e / (1 + sqrt(1 - e^2)) the true
@@ -89,7 +90,7 @@ class Orbit:
         arctan2 = elementary.arctan2 if xp is jnp else np.arctan2
         return eccentric + 2.0 * arctan2(b * xp.sin(eccentric), 1.0 - b * xp.cos(eccentric)), eccentric
 
-    def __call__(self, t: Any, xp: Any = jnp) -> Place:
+    def __call__(self, t: Any, xp: ModuleType = jnp) -> Place:
         """Return the place on the orbit at times (..,) [s]; see `anomalies`."""
         anomaly, eccentric = self.anomalies(t, xp)
         node, tilt, angle = self.ascending_node, self.inclination, self.perigee + anomaly
@@ -130,7 +131,7 @@ def unit(v: Any) -> Any:
     return v / ((v * v).sum(-1) ** 0.5)[..., None]
 
 
-def _eccentric_less_mean(mean: Any, e: Any, xp: Any) -> Any:
+def _eccentric_less_mean(mean: Any, e: Any, xp: ModuleType) -> Any:
     """Return E - M [rad] of Kepler's equation.
 
     Halley's iterations start at Danby's value (Celestial Mechanics 40, 1987). They are not differentiated.
@@ -176,7 +177,7 @@ class Fixed:
 
     vector: Any  # (3,) vector in this direction, in inertial axes
 
-    def __call__(self, t: Any, place: Any, orbit: Any, xp: Any) -> Any:
+    def __call__(self, t: Any, place: Place | None, orbit: Orbit | None, xp: ModuleType) -> Any:
         """Return vectors (.., 3) of any length in inertial axes.
 
         Args:
@@ -195,7 +196,7 @@ class OrbitDirection:
 
     name: str = field(metadata={"static": True})  # "nadir", "velocity" or "orbit_normal"
 
-    def __call__(self, t: Any, place: Any, orbit: Any, xp: Any) -> Any:
+    def __call__(self, t: Any, place: Place, orbit: Orbit, xp: ModuleType) -> Any:
         if self.name == "nadir":
             return -place.radial
         if self.name == "orbit_normal":
@@ -211,7 +212,7 @@ class GroundPoint:
 
     point: Any  # (3,) Earth-fixed coordinates of the point [m]
 
-    def __call__(self, t: Any, place: Any, orbit: Any, xp: Any) -> Any:
+    def __call__(self, t: Any, place: Place, orbit: Orbit, xp: ModuleType) -> Any:
         angle = orbit.earth_angle + EARTH_RATE * t
         sine, cosine = xp.sin(angle), xp.cos(angle)
         x, y, z = (self.point[k] for k in range(3))
@@ -227,7 +228,7 @@ class Sun:
     longitude: Any  # mean longitude of the Sun at t = 0 [rad]
     anomaly: Any  # mean anomaly of the Sun at t = 0 [rad]
 
-    def __call__(self, t: Any, place: Any, orbit: Any, xp: Any) -> Any:
+    def __call__(self, t: Any, place: Place | None, orbit: Orbit | None, xp: ModuleType) -> Any:
         g = self.anomaly + np.deg2rad(0.9856003) / DAY * t
         mean = self.longitude + np.deg2rad(0.9856474) / DAY * t
         ecliptic = mean + np.deg2rad(1.915) * xp.sin(g) + np.deg2rad(0.020) * xp.sin(2.0 * g)
@@ -280,11 +281,11 @@ class TwoVectorReference(MissionReference):
 
     primary: Direction
     secondary: Direction
-    orbit: Any  # `Orbit`, or None if no direction depends on it
+    orbit: Orbit | None  # None if no direction depends on it
     anchors: Leaf  # (n, 4) quaternions of the frame, without jumps of their signs, see `anchor_quaternions`
     anchor_rate: Leaf  # number of anchors per second [1/s]
 
-    def matrix(self, t: Any, xp: Any = jnp) -> Any:
+    def matrix(self, t: Any, xp: ModuleType = jnp) -> Any:
         """Return the rotation matrices (.., 3, 3) from the axes of the frame to inertial axes.
 
         The columns are the primary direction, the normal of both directions, and their cross product (TRIAD; Black,
@@ -298,7 +299,7 @@ class TwoVectorReference(MissionReference):
         second = unit(cross(first, second))
         return xp.stack([first, second, cross(first, second)], axis=-1)
 
-    def directions(self, t: Any, xp: Any = jnp) -> tuple[Any, Any]:
+    def directions(self, t: Any, xp: ModuleType = jnp) -> tuple[Any, Any]:
         """Return the primary and the secondary direction, unit vectors (.., 3) in inertial axes; see `matrix`."""
         position = None if self.orbit is None else self.orbit(t, xp)
         primary, secondary = (

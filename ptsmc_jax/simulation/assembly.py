@@ -5,6 +5,7 @@ from typing import Any
 
 import jax.numpy as jnp
 from jax.tree_util import Partial
+from jaxtyping import PyTree
 
 from ptsmc_jax.devices.actuators import Actuators
 from ptsmc_jax.devices.command_filter import CommandFilter
@@ -27,7 +28,7 @@ class Parts:
     controller: Any  # laws.base.Law
     observer: Any  # observers.base.Observer
     sensors: Any = field(default_factory=PerfectSensors)  # sensors.Sensor
-    initial: Any  # state of the plant
+    initial: PyTree  # state of the plant
     t_end: Leaf  # [s]
     window: Leaf  # length of the window after t_f, for window_error [s]
     settling_angle: Leaf  # a run has settled when its angle stays below this limit, for `settling_time` [rad]
@@ -47,12 +48,12 @@ class Parts:
             object.__setattr__(self, "disturbance", Function(self.disturbance))
 
     @property
-    def aligned_initial(self) -> Any:
+    def aligned_initial(self) -> PyTree:
         """The initial state in the form that the law can bring to the reference, see `Kinematics.align`."""
         return self.controller.kinematics.align(self.initial, self.reference(jnp.zeros_like(self.t_end)))
 
     @property
-    def period(self) -> Any:
+    def period(self) -> Leaf:
         """The control period of a sampled loop [s]."""
         return self.clock.period
 

@@ -7,6 +7,7 @@ is built. Intervals before t = 0 or after t_end have length zero and change noth
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from types import ModuleType
 from typing import Any, ClassVar
 
 import jax
@@ -55,7 +56,7 @@ class Anchored:
         """The number of samples."""
         return self.before + self.after
 
-    def long_enough_for(self, clocks: Sequence[Any]) -> "Anchored":
+    def long_enough_for(self, clocks: Sequence["Anchored"]) -> "Anchored":
         """Return this clock with as many samples before and after the hand-over as the longest of several clocks."""
         return replace(self, before=max(clock.before for clock in clocks), after=max(clock.after for clock in clocks))
 
@@ -87,7 +88,7 @@ class Flight:
     sampled: ClassVar[bool] = True
     anchored: ClassVar[bool] = False
 
-    def long_enough_for(self, clocks: Sequence[Any]) -> "Flight":
+    def long_enough_for(self, clocks: Sequence["Flight"]) -> "Flight":
         """Return this clock with as many samples as the longest of several clocks."""
         return replace(self, count=max(clock.count for clock in clocks))
 
@@ -122,7 +123,7 @@ class Graded:
         """The number of steps."""
         return self.before + self.after
 
-    def long_enough_for(self, clocks: Sequence[Any]) -> "Graded":
+    def long_enough_for(self, clocks: Sequence["Graded"]) -> "Graded":
         """Return this clock unchanged: its accuracy determines its number of steps, not the longest of the clocks."""
         return self
 
@@ -142,14 +143,14 @@ class Graded:
         hold = jnp.arange(t.size) >= nodes_before.size - 1
         return _full_intervals(t, t_next, hold)
 
-    def is_too_coarse(self, t_f: Any, delta: Any, xp: Any = jnp) -> Any:
+    def is_too_coarse(self, t_f: Any, delta: Any, xp: ModuleType = jnp) -> Any:
         """Return whether steps are longer than `LARGEST_STEP_FRACTION` allows; t_f and delta in s.
 
         This happens, for example, if t_f is twice the t_f that the grid was built for.
         """
         return self._grading_weight(t_f, delta, xp) < 1.0 / LARGEST_STEP_FRACTION
 
-    def _grading_weight(self, t_f: Any, delta: Any, xp: Any = jnp) -> Any:
+    def _grading_weight(self, t_f: Any, delta: Any, xp: ModuleType = jnp) -> Any:
         """Return the weight a in a ln(tau) + tau / max_step, by which nodes are spaced before the hand-over.
 
         If `max_step` is infinite, tau = t_f - t falls to 1/e in a steps.

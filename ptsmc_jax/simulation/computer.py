@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from ptsmc_jax.devices.actuators import ActuatorState
 from ptsmc_jax.devices.ticks import Ticks
@@ -19,19 +19,19 @@ from ptsmc_jax.simulation.assembly import Parts
 class Computer(NamedTuple):
     """The memory of the flight software between two samples."""
 
-    sensors: Any  # memory of the sensors
-    seen: Any  # state that the sensors measured at the last sample
-    observer: Any  # memory of the observer
-    law: Any  # memory of the law; None: the law has no memory
+    sensors: PyTree  # memory of the sensors
+    seen: PyTree  # state that the sensors measured at the last sample
+    observer: PyTree  # memory of the observer
+    law: PyTree  # memory of the law; None: the law has no memory
     # mean torque [N m] and wheel momentum [N m s] of the last period, as the flight software assumes them
     applied: tuple[Array, Array | None] | None  # None: the actuators hold `control_period.State.torque` exactly
-    command_filter: Any = None  # memory of the command filter; None: there is no filter
+    command_filter: PyTree = None  # memory of the command filter; None: there is no filter
 
 
 class Decision(NamedTuple):
     """The output of a flight computer at a sample."""
 
-    target: Any  # reference at the sample
+    target: PyTree  # reference at the sample
     d_hat: Array  # (m,) estimated disturbance [N m]
     u: Array  # (m,) commanded torque, after the command filter [N m]
     s: Array  # sliding variable of the law at the sample
@@ -58,7 +58,7 @@ class Period(NamedTuple):
         expected = jnp.where(self.now.partial, self.length, self.full_length)
         return jnp.where(self.length > 0.0, expected, 0.0)
 
-    def sample(self, memory: Any) -> Sample:
+    def sample(self, memory: PyTree) -> Sample:
         """Return the sample for the law with this memory. Its dt is never 0, so that the law can divide by it."""
         dt = jnp.where(self.length > 0.0, self.assumed_length, self.full_length)
         return Sample(self.now.t, self.now.hold, dt, memory)
@@ -71,15 +71,15 @@ SAMPLE_STATUSES = ("ok", "saturated", "missed", "singular", "input", "overflow",
 class Software(NamedTuple):
     """The flight software of a run: `boot` and `decide` of this module, or exported C instead of them."""
 
-    boot: Callable[[Parts, WholeNumber, WholeNumber, Any, Ticks], Computer]
+    boot: Callable[[Parts, WholeNumber, WholeNumber, PyTree, Ticks], Computer]
     # arguments: parts, k2, period, memory, visible state, state at star tracker readings, state of the actuators
-    decide: Callable[[Parts, Bound, Period, Computer, Any, Any, ActuatorState], tuple[Decision, Computer]]
+    decide: Callable[[Parts, Bound, Period, Computer, PyTree, PyTree, ActuatorState], tuple[Decision, Computer]]
     # returns the number of samples of a run by their status; None: the software reports none
     count_statuses: Callable[[Computer], dict[str, Array]] | None = None
     on_processor: bool = False  # whether it runs on the host processor only
 
 
-def boot(parts: Parts, seed: WholeNumber, trial: WholeNumber, x0: Any, first: Ticks) -> Computer:
+def boot(parts: Parts, seed: WholeNumber, trial: WholeNumber, x0: PyTree, first: Ticks) -> Computer:
     """Return the memory before the first sample. x0 is the true initial state, as far as sensors can measure it."""
     sensors = parts.sensors.begin(seed, trial, x0, first)
     zero = jnp.zeros(parts.plant.inputs)
@@ -88,7 +88,7 @@ def boot(parts: Parts, seed: WholeNumber, trial: WholeNumber, x0: Any, first: Ti
     return Computer(sensors, x0, parts.observer.begin(), parts.controller.begin(), applied, command_filter)
 
 
-def estimate(parts: Parts, period: Period, computer: Computer, seen: Any) -> tuple[Array, Any]:
+def estimate(parts: Parts, period: Period, computer: Computer, seen: PyTree) -> tuple[Array, PyTree]:
     """Return the disturbance (m,) [N m], estimated from the change of the state in the last period, and the memory."""
     observer, model, dt = parts.observer, parts.observer.model, period.dt_before
     assert computer.applied is not None
@@ -106,8 +106,8 @@ def decide(
     k2: Bound,
     period: Period,
     computer: Computer,
-    x: Any,
-    star_x: Any = None,
+    x: PyTree,
+    star_x: PyTree = None,
     actuator_state: ActuatorState | None = None,
 ) -> tuple[Decision, Computer]:
     """Run the flight software at a sample: sensors, observer, law, command filter.

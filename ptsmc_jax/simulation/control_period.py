@@ -5,11 +5,11 @@ The sampled loop, the linearisation of `theory.linear` and the test vectors of t
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from ptsmc_jax.devices.actuators import Actuators, ActuatorState, Drive
 from ptsmc_jax.devices.ticks import Ticks
@@ -36,12 +36,12 @@ class Tick(NamedTuple):
 class State(NamedTuple):
     """The state of a loop between two control periods. The continuous loop has the first three fields only."""
 
-    x: Any  # true state of the plant
+    x: PyTree  # true state of the plant
     torque: Array  # (m,) delivered at the end of the last period [N m]
     computer: Computer  # memory of the flight software; its `applied` is None if the actuators hold `torque`
     actuators: ActuatorState = ActuatorState(None, None, None)
     walk: Array | None = None  # (m,) random walk of the disturbance [N m]; None: there is none
-    star_x: Any = None  # true states at sensors' own sample times in the last period, see `star_state`
+    star_x: PyTree = None  # true states at sensors' own sample times in the last period, see `star_state`
     offset: Array | None = None  # delay of the next sample after its nominal time [s]; None: no timing jitter
 
     @property
@@ -56,7 +56,7 @@ class Record(NamedTuple):
     now: Ticks  # true times
     decision: Decision  # decision of the flight software; its target is the reference at the true time
     torques: Torques
-    x_after: Callable[[Scalar], Any]  # time since the start [s] -> true state then
+    x_after: Callable[[Scalar], PyTree]  # time since the start [s] -> true state then
     step: Scalar  # longest integration step [s]
     drive: Drive | None = None  # input of the actuators in the period
     tick: Tick | None = None  # nominal times; None in the continuous loop, and if sensors are simulated with exported C
@@ -147,7 +147,7 @@ def control_period(vehicle: Vehicle, state: State, tick: Tick) -> tuple[State, R
 
 
 def start(
-    parts: Parts, ticks: Ticks, x0: Any, seed: WholeNumber, trial: WholeNumber, software: Software = PYTHON_SOFTWARE
+    parts: Parts, ticks: Ticks, x0: PyTree, seed: WholeNumber, trial: WholeNumber, software: Software = PYTHON_SOFTWARE
 ) -> tuple[Vehicle, State]:
     """Return the constants of a sampled run, and its state before the first control period.
 
@@ -194,8 +194,8 @@ def first_period(ticks: Ticks) -> Ticks:
 
 
 def state_after(
-    parts: Parts, t: Scalar, x: Any, drive: Drive, walk: Array | None, dt: Scalar, *, rolled: bool = False
-) -> Any:
+    parts: Parts, t: Scalar, x: PyTree, drive: Drive, walk: Array | None, dt: Scalar, *, rolled: bool = False
+) -> PyTree:
     """Return the true state of the plant after a part of a control period.
 
     Args:
@@ -209,11 +209,11 @@ def state_after(
     """
     plant, step = parts.plant, dt / parts.substeps
 
-    def substep(k: Scalar, x: Any) -> Any:
+    def substep(k: Scalar, x: PyTree) -> PyTree:
         """Return the state after integration step k, which begins in the state x."""
         start, applied = t + k * step, parts.actuators.torque_over(drive, k * step, step)
 
-        def rate(time: Scalar, x_stage: Any) -> Any:
+        def rate(time: Scalar, x_stage: PyTree) -> PyTree:
             d = parts.disturbance(time, x_stage)
             torque = applied.torque_at(time - start, plant.velocity(x_stage))
             return plant.rate(time, x_stage, torque, d if walk is None else d + walk)
@@ -226,7 +226,7 @@ def state_after(
     return plant.normalise(jax.lax.scan(lambda x, k: (substep(k, x), None), x, starts)[0])
 
 
-def star_state(parts: Parts, now: Ticks, x_after: Callable[[Scalar], Any]) -> Any:
+def star_state(parts: Parts, now: Ticks, x_after: Callable[[Scalar], PyTree]) -> PyTree:
     """Return the true states when sensors with their own sample times take readings in a period, or None.
 
     The flight software gets these readings at the next sample or later.

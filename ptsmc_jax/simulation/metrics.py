@@ -134,7 +134,7 @@ class Running(NamedTuple):
     """Accumulators of the metrics of a run up to the present time."""
 
     arrival: Arrival
-    memories: dict[str, Any]  # accumulators of the metrics that the run has, by name
+    memories: dict[str, Array]  # accumulators of the metrics that the run has, by name
     pointing: PointingErrors | None  # accumulators of the pointing errors; None: pointing errors are not observed
 
 
@@ -155,14 +155,16 @@ class Metric:
     meaning: str
     of_states: tuple[str, str] | None = None  # unit and meaning for chains and systems; None: only for spacecraft
     table: str | None = None  # only runs with this table in the scenario have the metric; None: all runs
-    init: Callable[[Start, Criteria], Any] = _zero  # returns None if the run lacks the metric
-    update: Callable[[Any, Interval, Criteria], Any] | None = None
-    update_after_t_f: Callable[[Any, Interval, Errors, Criteria], Any] | None = None
-    value: Callable[[Any, Running, Criteria], Array] = lambda memory, running, criteria: memory
+    init: Callable[[Start, Criteria], Array | None] = _zero  # returns None if the run lacks the metric
+    update: Callable[[Array, Interval, Criteria], Array] | None = None
+    update_after_t_f: Callable[[Array, Interval, Errors, Criteria], Array] | None = None
+    value: Callable[[Array, Running, Criteria], Array] = lambda memory, running, criteria: memory
     may_be_nan: bool = False  # whether the metric may be NaN in a run that did not diverge
 
 
-def _peak(largest_in: Callable[[Interval], Any], init: Callable[[Start, Criteria], Any] = _zero) -> dict[str, Any]:
+def _peak(
+    largest_in: Callable[[Interval], Any], init: Callable[[Start, Criteria], Array | None] = _zero
+) -> dict[str, Any]:
     """Return `init` and `update` of the metric that is the largest value over all intervals.
 
     Args:

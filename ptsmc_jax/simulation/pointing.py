@@ -12,9 +12,9 @@ history of the present window is stored, and only if a requirement limits the re
 Start with `update`; `update_errors` accumulates the errors of the true and of the measured attitude.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,8 @@ from jaxtyping import Array, Float
 
 from ptsmc_jax.numerics import attitude, elementary, guards
 from ptsmc_jax.numerics.pytrees import Leaf, Scalar, pytree
+from ptsmc_jax.plants.rigid_body import AttitudeState
+from ptsmc_jax.signals.references import Target
 
 Vector = Float[Array, "3"]
 
@@ -90,7 +92,7 @@ class Pointing:
         return self.samples + 2 if any(name.startswith(index) for name in self.limits) else 0
 
 
-def boresight_frame(boresight: Any) -> np.ndarray:
+def boresight_frame(boresight: Sequence[float] | np.ndarray) -> np.ndarray:
     """Return the frame (3, 3) of a boresight (3,) of any length: rows are its unit vector and two directions across."""
     b = np.asarray(boresight, dtype=float)
     b = b / np.linalg.norm(b)
@@ -174,7 +176,7 @@ def hermite_path(start: Array, start_rate: Array, end: Array, end_rate: Array, l
 def error_path(start: tuple, end: tuple, frame: Float[Array, "3 3"], length: Scalar) -> ErrorPath:
     """Return the path of the attitude error between two pairs (state, target), over an interval of a length [s]."""
 
-    def error_and_rate(x: Any, target: Any) -> tuple[Array, Array]:
+    def error_and_rate(x: AttitudeState, target: Target) -> tuple[Array, Array]:
         rates = attitude.derivative(x.q, x.w), attitude.derivative(target.q, target.w)
         return jax.jvp(lambda q, target: attitude_error(q, target, frame), (x.q, target.q), rates)
 

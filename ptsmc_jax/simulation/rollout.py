@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from ptsmc_jax import programs
 from ptsmc_jax.devices.ticks import Ticks
@@ -75,7 +75,7 @@ def simulate(
     run = Run(parts, ticks, criteria, x0, target, target_t_f, unit, uncovered_from, record)
     loop = _sampled_loop(run, seed, trial, software) if parts.clock.sampled else _continuous_loop(run)
 
-    def step(carry: tuple[State, Score], interval: Any) -> tuple[tuple[State, Score], Log | None]:
+    def step(carry: tuple[State, Score], interval: PyTree) -> tuple[tuple[State, Score], Log | None]:
         state, score = carry
         after, record = loop.step(state, interval)
         row = run_state.history_row(run, state, after, record) if run.record else None
@@ -93,9 +93,9 @@ def simulate(
 class Loop(NamedTuple):
     """The sampled or the continuous loop of a run."""
 
-    step: Callable[[State, Any], tuple[State, Record]]  # simulates one control period or integration step
+    step: Callable[[State, PyTree], tuple[State, Record]]  # simulates one control period or integration step
     start: State
-    intervals: Any  # control periods or integration steps, arrays (intervals,)
+    intervals: PyTree  # control periods or integration steps, arrays (intervals,)
     last_row: Callable[[State, Log], Log]  # last state and all rows -> row of the history at t_end
 
 
@@ -111,7 +111,8 @@ def _sampled_loop(run: Run, seed: WholeNumber, trial: WholeNumber, software: Sof
         """Return the row with the estimate and s of a sample at t_end, and the torque held until then."""
         end_index = jnp.argmax(rows.t >= t_end)
         decision = Decision(run.parts.reference(t_end), rows.d_hat[end_index], state.torque, rows.s[end_index])
-        wheels = None if state.actuators.h is None else (state.actuators.h, state.actuators.v)
+        h, v = state.actuators.h, state.actuators.v
+        wheels = None if h is None or v is None else (h, v)
         row = run_state.history_row_at(
             run, t_end, state.x, decision, state.torque, jnp.asarray(True), state.walk, wheels
         )
@@ -139,7 +140,7 @@ def _continuous_loop(run: Run) -> Loop:
         (now, decay), x, memory = interval, state.x, state.computer.observer
         dt, target = now.t_next - now.t, parts.reference(now.t)
 
-        def rate(t: Scalar, x: Any, memory: Array) -> tuple[Any, Array, tuple[Array, Array]]:
+        def rate(t: Scalar, x: PyTree, memory: Array) -> tuple[PyTree, Array, tuple[Array, Array]]:
             sample = Sample(t, now.hold, dt)
             u, s, _ = controller(sample, x, parts.reference(t), observer.estimate(memory), k2(t))
             x_dot = parts.plant.rate(t, x, u, parts.disturbance(t, x))
@@ -192,7 +193,7 @@ def _check_continuous(parts: Parts) -> None:
         raise TypeError(f"the law {law} needs the sampled loop: use a sampled clock")
 
 
-def _check_shape(name: str, value: Any, allowed: list[tuple[int, ...]]) -> None:
+def _check_shape(name: str, value: object, allowed: list[tuple[int, ...]]) -> None:
     shape = getattr(value, "shape", None)
     if shape not in allowed:
         actual = f"of type {type(value).__name__}" if shape is None else f"one of shape {shape}"

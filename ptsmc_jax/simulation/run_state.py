@@ -1,11 +1,11 @@
 """Metrics, status and history of a run, in either loop."""
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from ptsmc_jax.devices.ticks import Ticks
 from ptsmc_jax.numerics import guards
@@ -42,13 +42,13 @@ class Log(NamedTuple):
     """
 
     t: Array  # [s]
-    x: Any  # true state
+    x: PyTree  # true state
     d_hat: Array  # estimated disturbance [N m]
     u: Array  # torque delivered from this time on [N m]
     commanded: Array  # [N m]
     s: Array  # sliding variable that the law used
     disturbance: Array  # true disturbance [N m]
-    reference: Any  # target of the reference
+    reference: PyTree  # target of the reference
     error: Array  # error that the law drives to zero: the attitude error vector [-]; for a chain x_1
     wheels: tuple[Array, Array] | None  # momentum of each reaction wheel [N m s], and its torque [N m]
     has_length: Array  # bool: the interval of this row has a positive length, or the row is the last
@@ -76,9 +76,9 @@ class Run(NamedTuple):
     parts: Parts
     ticks: Ticks
     criteria: Criteria
-    x0: Any
-    target_0: Any  # reference at t = 0
-    target_t_f: Any  # reference at t_f
+    x0: PyTree
+    target_0: PyTree  # reference at t = 0
+    target_t_f: PyTree  # reference at t_f
     singularity_distance_unit: Array  # divisor of the distance to the law's singularity, see `Kinematics`
     uncovered_from: Array  # first time for which the clock has no samples [s]; NaN: it covers t = 0 to t_end
     record: bool  # whether the history is recorded
@@ -151,7 +151,7 @@ def history_row(run: Run, before: State, after: State, record: Record) -> Log:
         record: record of the period.
     """
     now, tick, drive, decision, wheels = record.now, record.tick, record.drive, record.decision, None
-    if drive is not None and record.torques.wheel_torque is not None:
+    if drive is not None and drive.h is not None and record.torques.wheel_torque is not None:
         wheels = drive.h, record.torques.wheel_torque[0]
     u, has_length = record.torques.delivered[0], now.t_next > now.t
     row = history_row_at(run, now.t, before.x, decision, u, has_length, after.walk, wheels)
@@ -164,7 +164,14 @@ def history_row(run: Run, before: State, after: State, record: Record) -> Log:
 
 
 def history_row_at(
-    run: Run, t: Scalar, x: Any, decision: Decision, u: Array, has_length: Array, walk: Any = None, wheels: Any = None
+    run: Run,
+    t: Scalar,
+    x: PyTree,
+    decision: Decision,
+    u: Array,
+    has_length: Array,
+    walk: Array | None = None,
+    wheels: tuple[Array, Array] | None = None,
 ) -> Log:
     """Return a row of the history.
 
@@ -227,7 +234,7 @@ def is_not_converged(angle_at_t_f: Scalar, initial_angle: Scalar, settling_angle
     )
 
 
-def _snapshot(parts: Parts, target: Any, x: Any) -> Snapshot:
+def _snapshot(parts: Parts, target: PyTree, x: PyTree) -> Snapshot:
     angle, plant = parts.controller.kinematics.angle(x, target), parts.plant
     momentum = plant.momentum(x)
     momentum_norm = None if momentum is None else guards.norm(momentum)
@@ -235,7 +242,7 @@ def _snapshot(parts: Parts, target: Any, x: Any) -> Snapshot:
 
 
 def _check_state(
-    run: Run, score: Score, x: Any, target: Any, t: Scalar, step: Scalar, u: Array, memory: Any = None
+    run: Run, score: Score, x: PyTree, target: PyTree, t: Scalar, step: Scalar, u: Array, memory: PyTree = None
 ) -> Score:
     """Check the state at t, and return the score with status and `bad_time` of the first failure.
 
