@@ -35,7 +35,7 @@ from ptsmc_jax.onboard import derived, origins
 from ptsmc_jax.plants.base import Plant, State
 from ptsmc_jax.plants.rigid_body import AttitudeState
 from ptsmc_jax.signals.references import Target
-from ptsmc_jax.simulation import run_state
+from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.assembly import Parts
 
 ATTITUDE_IS_SET = 0.25  # |q|^2 of the quaternion in the state is larger if it has been set, and 0 before
@@ -433,7 +433,7 @@ def _add_law_stage(computer: Board, law: Law, observer: Observer, command_filter
             )
             singularity_distance, last = distance / unit, (values["last.command"], values["last.s"], memory_before)
             u, s, memory_after = jax.lax.cond(
-                singularity_distance >= run_state.SINGULAR_DISTANCE, evaluate_law, lambda: last
+                singularity_distance >= rollout.SINGULAR_DISTANCE, evaluate_law, lambda: last
             )
             memory_after |= {"singularity_distance": singularity_distance, "singularity_distance_unit": unit}
         else:

@@ -13,7 +13,7 @@ from ptsmc_jax.onboard.expressions import REAL
 from ptsmc_jax.onboard.fields import Field
 from ptsmc_jax.onboard.generate import Code
 from ptsmc_jax.onboard.printing import FILES, HELPERS, c_type, escape_comment_marks, format_comment, format_constant
-from ptsmc_jax.simulation import run_state
+from ptsmc_jax.simulation import rollout
 
 STATUS = {
     "OK": "new output",
@@ -203,7 +203,7 @@ def _conjunction(terms: Sequence[str]) -> str:
 
 def _step_values(code: Code) -> dict[str, str]:
     """Return the template values of the statuses, and of the calls in `ptsmc_init` and `ptsmc_step`."""
-    calls, lowest_distance = code.calls, format_constant(run_state.SINGULAR_DISTANCE, REAL)
+    calls, lowest_distance = code.calls, format_constant(rollout.SINGULAR_DISTANCE, REAL)
     arguments = re.findall(r"\w+", " ".join(calls.values()))
     can_be_singular = any(field.name == "singularity_distance" for field in code.state)
     statuses = [f"    PTSMC_{name} = {k}, /* {meaning} */" for k, (name, meaning) in enumerate(STATUS.items())]

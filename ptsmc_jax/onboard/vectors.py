@@ -21,7 +21,7 @@ from ptsmc_jax.numerics.draws import WholeNumber
 from ptsmc_jax.onboard.board import Board, Values
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.control_period import State, Tick, control_period, schedule, start
-from ptsmc_jax.simulation.run_state import SINGULAR_DISTANCE
+from ptsmc_jax.simulation.rollout import SINGULAR_DISTANCE
 
 
 class Samples(NamedTuple):

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from ptsmc_jax import programs
 from ptsmc_jax.batching import lapack
 from ptsmc_jax.numerics.pytrees import Scalar
-from ptsmc_jax.simulation import run_state
+from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.theory import limit_cycles, linear, margins
 from ptsmc_jax.theory.limit_cycles import History, command_history
@@ -35,8 +35,8 @@ class Course(NamedTuple):
     at_input: Margins  # (times, m) Margins of the loop opened at each input.
     at_sensors: Margins  # (k,) Margins of the loop opened at each measured signal, in the hold phase.
     together: dict[str, float]  # Margins in the hold phase if gain, phase or delay changes equally in all inputs.
-    singularity_distance: float  # Smallest distance to the singularity, in the unit of `run_state.SINGULAR_DISTANCE`.
-    not_converged: bool  # Whether the run has not converged at t_f, see `run_state.is_not_converged`.
+    singularity_distance: float  # Smallest distance to the singularity, in the unit of `rollout.SINGULAR_DISTANCE`.
+    not_converged: bool  # Whether the run has not converged at t_f, see `rollout.is_not_converged`.
     limit_cycle: limit_cycles.LimitCycle | None = None  # Limit cycle in the hold phase, if there is one.
 
     @property
@@ -222,7 +222,7 @@ def _run_data(parts: Parts, run: linear.NominalRun, times: int) -> tuple[Array, 
         law.kinematics.angle(jax.tree.map(lambda v, k=k: v[k], run.carry.x), parts.reference(t[k]))
         for k in (0, jnp.argmax(t >= law.t_f))
     )
-    not_converged = run_state.is_not_converged(final_angle, first_angle, parts.settling_angle)
+    not_converged = rollout.is_not_converged(final_angle, first_angle, parts.settling_angle)
     return jnp.append(judged_times(parts), further_times), command_history(parts, run), nearest, not_converged
 
 

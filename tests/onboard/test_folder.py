@@ -20,7 +20,7 @@ from ptsmc_jax.onboard.board import build_board
 from ptsmc_jax.onboard.library import Library, compiler
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.law_tables import LAWS
-from ptsmc_jax.simulation import run_state
+from ptsmc_jax.simulation import rollout
 from tests.helpers import SHORT, fly, short
 from tests.onboard.compiled import CC, STRICT, needs_compiler, step_many
 from tests.onboard.flights import FLIGHTS, flight
@@ -319,7 +319,7 @@ def test_exported_c_has_the_names_and_equations_of_the_law(exported):
 
 
 def test_singularity_limit_in_c_equals_that_of_the_simulator(monkeypatch):
-    monkeypatch.setattr(run_state, "SINGULAR_DISTANCE", 0.0125)
+    monkeypatch.setattr(rollout, "SINGULAR_DISTANCE", 0.0125)
     made = folder.Controller(scenario.from_tables(flight()), "short", "a scenario")
     code = templates.controller_texts(made.code, made.info)["ptsmc_short.c"]
     limits = re.findall(r"singularity_distance >= R\((.*?)\)", code)
