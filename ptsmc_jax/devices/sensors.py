@@ -150,7 +150,7 @@ class Memory(NamedTuple):
 
     keys: tuple[draws.Key, ...] | None  # random keys of each noise and of the bias drift; None without noise
     noise: tuple[Array, ...]  # noise of the next sample
-    bias: Any  # (3,) gyro bias [rad/s]; None without bias
+    bias: Array | None  # (3,) gyro bias [rad/s]; None without bias
     estimate: Any  # `Estimate`; None without a filter
     rate: Any  # (3,) last measured rate [rad/s]; None without a filter
 
@@ -160,9 +160,9 @@ class SpacecraftSensors(Sensor):
 
     rate_bias: Any
     bias_rate: Any
-    given_bias: Any
-    rate_scale: Any
-    outage: Any
+    given_bias: Leaf | None
+    rate_scale: Leaf | None
+    outage: Leaf | None
     noise_free: bool
 
     @property
@@ -203,8 +203,8 @@ class SpacecraftSensors(Sensor):
         return jnp.zeros(6) if self.noise_free else draws.normals(draws.stream(seed, trial, FILTER_START), 6)
 
     def gyro_sample(
-        self, memory: Any, w: Float[Array, "3"], noise: Float[Array, "3"], now: Ticks, dt: Scalar
-    ) -> tuple[Float[Array, "3"], Any]:
+        self, memory: PyTree, w: Float[Array, "3"], noise: Float[Array, "3"], now: Ticks, dt: Scalar
+    ) -> tuple[Float[Array, "3"], Array | None]:
         """Return the gyro sample (3,) [rad/s], and the gyro bias (3,) [rad/s] or None.
 
         Args:
@@ -261,7 +261,7 @@ class Sensors(SpacecraftSensors):
             return q
         return attitude.multiply(q, attitude.from_rotation_vector(self.misalignment))
 
-    def with_bandwidth(self, bandwidth: Any, period: Any) -> "Sensors":
+    def with_bandwidth(self, bandwidth: Leaf | float, period: Leaf) -> "Sensors":
         """Return the sensors with a filter of another bandwidth [rad/s], for a control period [s]."""
         bias_walk = 0.0 if self.bias_rate is None else self.bias_rate * guards.sqrt(period)
         noises = self.attitude_noise, self.rate_noise, bias_walk
@@ -270,7 +270,7 @@ class Sensors(SpacecraftSensors):
         times = self.own_times
         return replace(self, filter=filter_between_samples(bandwidth, *noises, period, times.interval, times.pattern))
 
-    def bandwidth(self, period: Any) -> Any:
+    def bandwidth(self, period: Leaf) -> Array:
         """Return the bandwidth of the filter [rad/s] for a control period [s]."""
         assert self.filter is not None
         interval = period * self.every if self.own_times is None else self.own_times.interval

@@ -59,7 +59,7 @@ class Record(NamedTuple):
     x_after: Callable[[Scalar], PyTree]  # time since the start [s] -> true state then
     step: Scalar  # longest integration step [s]
     drive: Drive | None = None  # input of the actuators in the period
-    tick: Tick | None = None  # nominal times; None in the continuous loop, and if sensors are simulated with exported C
+    tick: Tick | None = None  # nominal times; None in the continuous loop, and with software on the host processor
 
 
 class Vehicle(NamedTuple):
