@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
 from ptsmc_jax.declare import Scaled, number
 from ptsmc_jax.numerics import attitude, elementary

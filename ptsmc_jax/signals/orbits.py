@@ -281,7 +281,7 @@ class TwoVectorReference(MissionReference):
 
     primary: Direction
     secondary: Direction
-    orbit: Orbit | None  # None if no direction depends on it
+    orbit: Any  # `Orbit`, or None if no direction depends on it
     anchors: Leaf  # (n, 4) quaternions of the frame, without jumps of their signs, see `anchor_quaternions`
     anchor_rate: Leaf  # number of anchors per second [1/s]
 
@@ -301,10 +301,9 @@ class TwoVectorReference(MissionReference):
 
     def directions(self, t: Any, xp: ModuleType = jnp) -> tuple[Any, Any]:
         """Return the primary and the secondary direction, unit vectors (.., 3) in inertial axes; see `matrix`."""
-        position = None if self.orbit is None else self.orbit(t, xp)
-        primary, secondary = (
-            unit(direction(t, position, self.orbit, xp)) for direction in (self.primary, self.secondary)
-        )
+        orbit: Any = self.orbit
+        position: Any = None if self.orbit is None else self.orbit(t, xp)
+        primary, secondary = (unit(direction(t, position, orbit, xp)) for direction in (self.primary, self.secondary))
         return primary, secondary
 
     def frame(self, t: Scalar) -> Float[Array, "4"]:
