@@ -92,7 +92,16 @@ def _write_disturbance(
     std: np.ndarray,
     relative: dict[str, object],
 ) -> None:
-    """Write the estimate of a disturbance into the terms of its table; a bias becomes an additional term."""
+    """Write the estimate of a disturbance into [disturbance], and its spread into [dispersion].
+
+    Args:
+        tables: tables of the scenario; [disturbance] changes. An estimated bias becomes an additional constant term.
+        dispersion: table [dispersion], which changes.
+        name: estimated parameter, such as "disturbance_amplitude".
+        numbers: the estimates.
+        std: 1 sigma of the estimates.
+        relative: dispersion of an amplitude, a table with a kind.
+    """
     table = dict(tables.get("disturbance", {}))
     terms = [dict(term) for term in table.get("terms", [])] or [table]
     if name == "disturbance_bias":

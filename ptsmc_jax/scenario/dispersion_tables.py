@@ -53,7 +53,7 @@ class Numbers(Table, frozen=True):
         return self.largest_deviation * float(self.widths()[0])
 
     def build(self, parts: "Parts", count: int) -> RandomNumbers:
-        """Return `dispersions.numbers.RandomNumbers`, (count,)."""
+        """Return the distribution of `count` random numbers (count,)."""
         return RandomNumbers(self.distribution, vector(self.widths(count)))
 
 
@@ -163,7 +163,7 @@ class UniformAttitude(Table, frozen=True):
         return np.pi
 
     def build(self, parts: "Parts", count: int) -> RandomNumbers:
-        """Return `dispersions.numbers.RandomNumbers`."""
+        """Return the distribution of the random numbers."""
         return any_attitude()
 
 
@@ -179,7 +179,7 @@ class AxisAngle(Table, frozen=True):
         return float(np.deg2rad(self.max_deg))
 
     def build(self, parts: "Parts", count: int) -> RandomNumbers:
-        """Return `dispersions.numbers.RandomNumbers`."""
+        """Return the distribution of the random numbers."""
         return axis_angle(np.deg2rad(self.min_deg), np.deg2rad(self.max_deg))
 
 
@@ -194,7 +194,7 @@ class NormalAttitude(Table, frozen=True):
         return min(angle + 4.6 * float(np.deg2rad(self.std_deg)), np.pi)
 
     def build(self, parts: "Parts", count: int) -> RandomNumbers:
-        """Return `dispersions.numbers.RandomNumbers`, a rotation vector."""
+        """Return the distribution of a rotation vector (3,) [rad]."""
         return RandomNumbers("normal", vector(np.full(3, np.deg2rad(self.std_deg))))
 
 
@@ -263,7 +263,7 @@ class UniformPhase(Table, frozen=True):
     kind: Literal["uniform"] = "uniform"
 
     def build(self, parts: "Parts", count: int) -> RandomNumbers:
-        """Return `dispersions.numbers.RandomNumbers`."""
+        """Return the distribution of the random numbers."""
         return RandomNumbers("interval", vector(np.full(count, 2.0 * np.pi)))
 
 
@@ -293,7 +293,7 @@ class Outage(Interval, frozen=True):
     scaled: ClassVar[Mapping[str, Scaled]] = {"duration": Scaled(10.0, time=1)}
 
     def build(self, parts: "Parts", count: int) -> RandomNumbers:
-        """Return `dispersions.numbers.RandomNumbers`: the random begin, and the duration."""
+        """Return the distribution of the random begin, and the duration."""
         assert self.duration is not None  # `scenario.reading` has filled in the default
         return dataclasses.replace(self.numbers(parts, self.duration, self.duration), common=True)
 
@@ -305,7 +305,7 @@ class Failure(Interval, frozen=True):
     known: Annotated[Truth, Meaning("whether the allocation uses the other wheels after the failure")] = False
 
     def build(self, parts: "Parts", count: int) -> RandomNumbers:
-        """Return `dispersions.numbers.RandomNumbers`: the time, and a number on (0, 1) that chooses the wheel."""
+        """Return the distribution of the time, and a number on (0, 1) that chooses the wheel."""
         return self.numbers(parts, 0.0, 1.0)
 
 
@@ -319,7 +319,7 @@ class Jitter(Table, frozen=True):
     smallest: Annotated[NotNegative, Meaning("smallest value of the largest timing error")] = 0.0
 
     def build(self, parts: "Parts", count: int) -> RandomNumbers:
-        """Return `dispersions.numbers.RandomNumbers`."""
+        """Return the distribution of the random numbers."""
         return interval([self.smallest], [self.largest])
 
 

@@ -292,9 +292,10 @@ def largest_deviation(scenario: "Scenario", key: str) -> float:
 
 
 def observer_rate(scenario: "Scenario") -> float:
-    """Return l / J of the published observer [1/s], scaled to the mission and at most 1 / h.
+    """Return the rate l / J of the published observer [1/s], with gain l and mean moment of inertia J.
 
-    For a plant without a body the published rate is 10 1/s.
+    It is scaled by t_f. In the sampled loop it is at most one over the control period. For a plant without a body
+    the published rate is 10 1/s.
     """
     rate = mission.scales(scenario).scaled_value(
         Scaled(10.0 if scenario.moments[0] is None else PUBLISHED_RATE, time=-1)

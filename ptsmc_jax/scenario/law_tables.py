@@ -277,7 +277,7 @@ class FiniteTimeTable(ObserverTable, frozen=True):
     """An observer whose gain is a bound on the disturbance's rate."""
 
     def fill_defaults(self, scenario: "Scenario") -> Self:
-        """Fill an absent gain from the bound on the disturbance's rate."""
+        """Return the table; an absent gain becomes 20 times the bound on the disturbance's rate, on all axes."""
         if self.gain is not None:  # pyright: ignore[reportAttributeAccessIssue]
             return self
         rate = scenario.controller.disturbance_rate_bound

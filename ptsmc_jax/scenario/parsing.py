@@ -266,7 +266,7 @@ def _without_none(value: object) -> object:
 
 
 def nearest_name_hint(name: str, known: Iterable[str], template: str = "{}") -> str:
-    """Return a hint for an unknown name: the one or two most similar known names, or the first known names.
+    """Return a hint for an unknown name: one or two similar known names, or else the first `MOST_LISTED` known ones.
 
     Args:
         name: the unknown name.

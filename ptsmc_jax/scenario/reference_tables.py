@@ -52,7 +52,10 @@ class ReferenceTable(PartTable, frozen=True):
         """Raise ScenarioError if keys are not valid, or contradict other tables."""
 
     def check_reference_until(self, scenario: "SpacecraftScenario", last: float, key: str) -> None:
-        """Raise ScenarioError if the reference ends before a run until `last` [s]; key: determines that time."""
+        """Raise ScenarioError if the reference ends before the time `last` [s], at which a run ends.
+
+        key: the key of the scenario that sets this time, for the error.
+        """
 
     def build(self, scenario: "SpacecraftScenario") -> references.Reference:
         """Return the part of `signals`."""

@@ -193,7 +193,10 @@ def charts(laws: dict[str, Law]) -> dict[str, list[Block]]:
 
 
 def reference_lines(question: Question, laws: list[Law]) -> dict[str, float]:
-    """Return the lines of a chart: the smallest lower bound of the error [arcsec] of all laws, or a required limit."""
+    """Return the horizontal line of a chart by its name; empty: none.
+
+    For the accuracy it is the smallest lower bound of the error over all laws [arcsec], for a margin its limit.
+    """
     if question.judged:
         bounds = [bound for law in laws if (bound := _to_arcsec(law.lower_bound))]
         return {"lower bound": min(bounds)} if bounds else {}

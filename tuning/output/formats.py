@@ -48,7 +48,7 @@ def format_angle(value: float | None) -> str:
 
 
 def in_readable_unit(name: str, unit: str, *values: float | None) -> tuple[str, list[float]]:
-    """Return values in a readable unit: angles in arcsec or, if one is at least one degree, in degrees.
+    """Return values in a readable unit: angles in arcsec, or in degrees if the largest one is at least one degree.
 
     Args:
         name: name of the metric or the input. The norm of an attitude error becomes an angle, see `as_angle`.
