@@ -88,6 +88,10 @@ def test_an_interrupt_while_functions_work_is_raised_in_their_next_requests_and_
         finally:
             stopped.append("best so far")
 
-    with pytest.raises(KeyboardInterrupt):
-        run_in_lockstep([work, lambda ask: ask("only")], lambda questions: [None for _ in questions], width=2)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a process in the background may ignore it
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run_in_lockstep([work, lambda ask: ask("only")], lambda questions: [None for _ in questions], width=2)
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert stopped == ["best so far"]
