@@ -57,6 +57,7 @@ def exact_error(t: Scalar, t_f: Scalar, eta: Scalar, error: Vector, error_rate: 
     """Return the motion of each component of the attitude error vector under the second-order law.
 
         x(t) = r^eta (x(0) - s(0) ln r),  s(t) = s(0) r^eta,  s(0) = t_f x'(0) + eta x(0),  r = (t_f - t) / t_f
+
     Args:
         t: time since the start of the run [s], in the approach phase (below t_f).
         t_f: prescribed time [s].
