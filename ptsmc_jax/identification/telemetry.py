@@ -301,23 +301,27 @@ def _move_to_measurement_times(
 def _check_rates_match_attitudes(table: _Table, t: Values, readings: dict[str, Values]) -> None:
     """Raise RefusedError if the attitudes and the rates describe different motions.
 
-    The rotation of the attitude over each part of the log is compared with the integral of the rate. Parts with a
-    rotation below 0.02 rad or above 0.5 rad are ignored.
+    The sum of the rotations from sample to sample over each part of the log is compared with the integral of the rate.
+    Parts that turn by less than 0.02 rad, or by more than 0.5 rad between two samples, are ignored.
     """
     if set(readings) != {"attitude", "rate"}:
         return
     q, rate = readings["attitude"], readings["rate"]
     common_rows = np.flatnonzero(~np.isnan(q[:, 0]) & ~np.isnan(rate[:, 0]))
-    part_ends = common_rows[:: max(1, common_rows.size // COMPARED_PARTS)]
+    part_ends = np.arange(0, common_rows.size, max(1, common_rows.size // COMPARED_PARTS))
     if part_ends.size < MIN_ROWS:
         return
     has_rate = ~np.isnan(rate[:, 0])
     interpolated = np.stack([np.interp(t, t[has_rate], column[has_rate]) for column in rate.T], axis=1)
     increments = 0.5 * (interpolated[1:] + interpolated[:-1]) * np.diff(t)[:, None]
-    integral = np.concatenate([np.zeros((1, 3)), np.cumsum(increments, axis=0)])[part_ends]
-    rotations = (Rotation.from_quat(q[part_ends[:-1]]).inv() * Rotation.from_quat(q[part_ends[1:]])).as_rotvec()
-    angle, difference = np.linalg.norm(rotations, axis=1), np.linalg.norm(rotations - np.diff(integral, axis=0), axis=1)
-    is_comparable = (angle > 0.02) & (angle < 0.5)
+    integral = np.concatenate([np.zeros((1, 3)), np.cumsum(increments, axis=0)])[common_rows]
+    attitudes = Rotation.from_quat(q[common_rows])
+    rotations = (attitudes[:-1].inv() * attitudes[1:]).as_rotvec()
+    turns = np.concatenate([np.zeros((1, 3)), np.cumsum(rotations, axis=0)])
+    turn, rate_turn = (np.diff(values[part_ends], axis=0) for values in (turns, integral))
+    largest_step = np.maximum.reduceat(np.linalg.norm(rotations, axis=1), part_ends[:-1])
+    angle, difference = np.linalg.norm(turn, axis=1), np.linalg.norm(turn - rate_turn, axis=1)
+    is_comparable = (angle > 0.02) & (largest_step < 0.5)
     if is_comparable.sum() < 5:
         return
     median_ratio = np.median(difference[is_comparable] / angle[is_comparable])

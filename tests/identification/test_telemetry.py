@@ -1,5 +1,7 @@
 """Reading telemetry: units, orders, gaps, times, and one sentence for each broken table."""
 
+from contextlib import nullcontext
+
 import numpy as np
 import polars as pl
 import pytest
@@ -142,6 +144,18 @@ BROKEN = [
 def test_a_broken_table_is_refused_in_one_sentence_with_row_and_column(table, rows, words):
     with refuses(RefusedError, words):
         telemetry.measurements(loaded(**table), rows)
+
+
+@pytest.mark.parametrize(("unit", "is_right"), [("rad/s", True), ("deg/s", False)])
+def test_rates_of_a_long_log_of_a_spinning_spacecraft_fit_its_attitudes(unit, is_right):
+    """The log is compared in parts, and the body turns by about one revolution in each of them."""
+    t = np.arange(20_000) / 10.0
+    rate = np.tile([0.0, 0.0, 1.3], (t.size, 1))
+    attitude = Rotation.from_rotvec(rate * t[:, None] + 1e-3 * np.random.default_rng(0).standard_normal(rate.shape))
+    columns = {"t": t} | {f"measured_q{k + 1}": attitude.as_quat()[:, k] for k in range(4)}
+    columns |= {f"measured_w{k + 1}": rate[:, k] for k in range(3)} | {f"sent{k + 1}": 0.0 * t for k in range(3)}
+    with nullcontext() if is_right else refuses(RefusedError, "has rates that do not fit its attitudes"):
+        telemetry.measurements(loaded(rate_unit=unit), pl.DataFrame(columns))
 
 
 @pytest.mark.parametrize(
