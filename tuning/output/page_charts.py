@@ -16,7 +16,8 @@ DASHES = ("solid", "dash", "dashdot", "dot", "longdashdot")
 SYMBOLS = ("circle", "diamond", "triangle-up", "square")
 POINTS = 3000  # largest number of points of a history in a chart
 FRAMES = 60  # number of frames of the animated body
-_DECADES = {"type": "log", "dtick": "D2", "tickformat": "~g", "automargin": True}
+_LOGARITHMIC = {"type": "log", "tickformat": "~g", "automargin": True}
+_DECADES = {**_LOGARITHMIC, "dtick": "D2"}
 # title and unit of each panel of a spacecraft's history; states of other plants have no units
 PANELS = {
     "q": ("attitude quaternion", "-"), "w": ("body rate", "rad/s"), "x": ("state", ""),
@@ -232,7 +233,7 @@ def search(
             "marker": {"size": 6, "symbol": ["circle" if one else "circle-open" for one in met]},
             "line": {"width": 1, "color": COLOURS[k % len(COLOURS)]},
         })  # fmt: skip
-    y_axis = {"title": {"text": title}, **_DECADES}
+    y_axis = {"title": {"text": title}, **_LOGARITHMIC}  # its values may be within a factor of 2
     return {"data": data, "layout": _layout(xaxis={"title": {"text": "step of the local search"}}, yaxis=y_axis)}
 
 
