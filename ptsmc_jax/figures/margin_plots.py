@@ -96,7 +96,7 @@ def margins_over_time(time_to_go: np.ndarray, judged: np.ndarray, before: Margin
             axes.set_xlim(far, near)
     for axes in rows:
         axes.legend(fontsize=9, ncols=2, frameon=True, framealpha=1.0, edgecolor="white")
-    rows[-1].set_xlabel("time to go $t_f - t$ before the hand-over [s]")
+    rows[-1].set_xlabel("time to go $t_f - t$ [s], until the hand-over")
     plain_ticks(rows[-1].xaxis)
     rows[0].set_title("Margins of the nominal loop with frozen gains, worst axis", loc="left")
     return figure

@@ -85,6 +85,7 @@ class Problem:
     parameters: list[Parameter]
     max_step: float  # longest integration step [s]
     has_gyro_bias: bool  # whether the gyro bias is estimated
+    dispersed: tuple[str, ...] = ()  # parameters that [dispersion] varies, but that are not free
 
     @property
     def size(self) -> int:
@@ -164,7 +165,9 @@ def build(scenario: Scenario, logs: Sequence[Measurements], names: Sequence[str]
     frequencies = [float(np.max(np.asarray(getattr(setup.plant, "frequency", [0.0]))))]
     fastest = max([*frequencies, *(term.largest_frequency() for term in scenario.terms)])
     max_step = min(interval * 1.5, 0.2 / fastest if fastest > 0.0 else np.inf)
-    return Problem(model, selected, max_step, GYRO_BIAS in names)
+    free = [parameter.name for parameter in selected]
+    dispersed = (name for name in possible if getattr(scenario.dispersion, name, None) is not None)
+    return Problem(model, selected, max_step, GYRO_BIAS in names, tuple(name for name in dispersed if name not in free))
 
 
 def _build_model(

@@ -198,7 +198,8 @@ def innovations(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
 
 def verdict(identification: Identification) -> list[str]:
     """Return sentences that state whether the model explains each log, and which parameters are not determined."""
-    lines = []
+    lines, dispersed = [], identification.problem.dispersed
+    advice = f"free {', '.join(dispersed)}, which [dispersion] varies" if dispersed else "free more parameters"
     for fit in [*identification.fits, *identification.validation]:
         name = f"{fit.log.name} (validation)" if fit in identification.validation else fit.log.name
         details = f"mean square {fit.mean_square:.3g} of its expected value"
@@ -210,7 +211,7 @@ def verdict(identification: Identification) -> list[str]:
             largest = float(np.max(np.abs(fit.autocorrelation())))
             lines.append(
                 f"the model does NOT explain {name}: innovations with {details} and an autocorrelation of "
-                f"{largest:.2g} within {LAGS} readings; free more parameters, or add torque_walk to [identify]"
+                f"{largest:.2g} within {LAGS} readings; {advice}, or add torque_walk to [identify]"
             )
         if fit.outlier_count:
             lines.append(f"{fit.outlier_count} readings of {name} are outliers and were not used")

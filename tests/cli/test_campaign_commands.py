@@ -387,7 +387,10 @@ def test_a_folder_without_a_campaign_is_refused(command, tmp_path, asked):
     (tmp_path / "empty").mkdir()
     for folder in ("empty", "not-there"):
         error = refused(command, tmp_path, asked[0], folder, *asked[1:])
-        assert f"{folder} is not a campaign, but must be a folder of `ptsmc montecarlo`" in error
+        assert (
+            f"{folder} is not a campaign, or its versions.json is damaged; allowed is a folder of `ptsmc montecarlo`"
+            in error
+        )
     assert command("simulate", "s.toml", "--out", "run", "--no-figures", "--quiet")[0] == 0
     assert "run has results of `ptsmc simulate`" in command(asked[0], "run", *asked[1:])[2]
 

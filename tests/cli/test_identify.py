@@ -68,6 +68,15 @@ def test_a_simulated_run_gives_its_parameters_and_a_page(command, logged):
     assert "actuator_scale" in (folder / "report.html").read_text()
 
 
+def test_a_doubtful_result_names_dispersed_parameters_that_are_not_free(command, logged):
+    """The log has 1.25 times the torque of the scenario, and no free parameter explains it."""
+    text = SCENARIO.replace('["actuator_scale", "disturbance_bias"]', '["disturbance_bias"]')
+    (logged / "few.toml").write_text(text + '[dispersion]\nactuator_scale = { kind = "relative_normal", std = 0.2 }\n')
+    status, out, _ = command("identify", "few.toml", "run/trajectory.csv", "--out", "few", "--no-figures")
+    assert status == 1
+    assert "free actuator_scale, which [dispersion] varies" in out
+
+
 def test_a_design_has_a_profile_within_the_limits(command, logged):
     status, out, err = command("identify", "s.toml", "--design", "--duration", 6, "--rate", 0.5, "--out", "plan")
     assert status == 0, err

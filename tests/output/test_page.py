@@ -207,7 +207,7 @@ def test_what_is_no_result_is_refused(command, simulated, tmp_path):
     for folder, said in (
         ("none", "none is no folder"),
         ("s.toml", "s.toml is no folder"),
-        ("empty", "empty holds no result"),
+        ("empty", "empty holds no result, or its versions.json is damaged"),
     ):
         assert refused(command, tmp_path, "report", folder).startswith(f"ptsmc: {said}; allowed is ")
     kept = tree(simulated)
@@ -218,7 +218,11 @@ def test_what_is_no_result_is_refused(command, simulated, tmp_path):
         ("summary.json", "{}", "run/summary.json is damaged or of another version: 'verdicts' is missing; "),
         ("summary.json", '{"verdicts": 1}', "run/summary.json is damaged or of another version: "),
         ("summary.json", '{"verdicts": {}}', "run/summary.json is damaged or of another version: "),
-        ("versions.json", "[]", "run holds no result; allowed is a folder that a ptsmc command wrote"),
+        (
+            "versions.json",
+            "[]",
+            "run holds no result, or its versions.json is damaged; allowed is a folder",
+        ),
         ("versions.json", '{"command": ["x"]}', "run holds no result"),
         ("scenario.toml", None, "the scenario file run/scenario.toml does not exist"),
         ("scenario.toml", "a = [", "the scenario file run/scenario.toml is no valid TOML: "),

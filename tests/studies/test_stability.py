@@ -240,7 +240,7 @@ def test_saturated_command_is_reported_as_an_open_loop():
     lines = reported(found).lines
     assert not any(word in line for line in lines for word in ("dispersed", "misses", "limit of the actuators"))
     (judged,) = [one["time_to_go"] for one in found["before"] if one["judged"]]
-    assert lines[0].endswith(f"at {judged:.3g} s to go")
+    assert f"at {judged:.3g} s to go; " in lines[0]
     # margins at all inputs together and at the sensors may be smaller; the table has them
     assert lines[1].startswith("margins at all inputs together and at the sensors are not judged")
     # margins of an axis if another axis makes the loop unstable

@@ -183,7 +183,7 @@ def budget_lines(summary: Campaign, pointing: Row) -> Iterator[str]:
         if summary.simulated >= many and ended_early:
             yield f"an angle is - because {ended_early} runs did not reach their end"
         else:
-            yield f"an angle is - without {many} runs that all reach their end ({few} for 90 % confidence)"
+            yield f"an angle is - because it needs {many} runs that all reach their end ({few} for 90 % confidence)"
 
 
 def budget_table(pointing: Row) -> Table:

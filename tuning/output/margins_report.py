@@ -55,7 +55,7 @@ def _condition_lines(summary: Margins) -> Iterator[str]:
     if summary.stable and not summary.open:
         times = sorted(loop["time_to_go"] for loop in summary.before if loop["judged"])
         approach = f" and, with frozen gains, at {_format_times(times)}" if times else ""
-        yield f"margins are judged in the hold phase{approach}"
+        yield f"these are the smallest margins in the hold phase{approach}; margins.csv has them over time"
         yield "margins at all inputs together and at the sensors are not judged; they can be smaller, see the table"
     if summary.limit_cycle is not None:
         yield from limit_cycle_lines(summary.limit_cycle)

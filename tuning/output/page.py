@@ -106,7 +106,9 @@ def read(folder: Path) -> Result:
     versions = store.read_versions(folder)
     command = str(versions.get("command"))
     if command not in reports.REPORTS:
-        raise RefusedError(f"{folder} holds no result; allowed is a folder that a ptsmc command wrote")
+        raise RefusedError(
+            f"{folder} holds no result, or its versions.json is damaged; allowed is a folder that a ptsmc command wrote"
+        )
     source = folder / ("map.csv" if command == "map" else store.SUMMARY)
     for path in (source, folder / TABLES.get(command, source.name)):
         if not path.exists():

@@ -340,7 +340,9 @@ def open_folder(path: Path) -> Folder:
     except RefusedError:
         raise
     except (ValueError, msgspec.ValidationError):
-        raise RefusedError(f"{path} is not a campaign, but must be a folder of `ptsmc montecarlo`") from None
+        raise RefusedError(
+            f"{path} is not a campaign, or its versions.json is damaged; allowed is a folder of `ptsmc montecarlo`"
+        ) from None
     checksums = {name: value for name, value in versions.items() if name.endswith("_sha256") and isinstance(value, str)}
     return Folder(
         path=path,
