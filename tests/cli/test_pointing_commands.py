@@ -97,7 +97,7 @@ def test_pointing_requirements_have_verdicts_budget_and_table(simulated, tmp_pat
     assert budget["ape"]["x"] is None  # 150 runs are too few for 99.73 %
     for place in (said, checked(tmp_path / FOLDER).text):
         assert "from 0.5 s after t_f to t_end, with 95 % confidence; boresight 1, 0, 0" in place
-        assert "an angle is - without 1109 runs that all reach their end (852 for 90 % confidence)" in place
+        assert "needs 1109 runs that all reach their end (852 for 90 % confidence)" in place
         assert "ape_boresight at most 2062.65 arcsec in 50 % of the time of all runs" in place
     (section,) = campaign_report.pointing_sections(summaries.read(summaries.Campaign, found))
     table = section.blocks[-1]
