@@ -61,8 +61,8 @@ tables below.
 | `margin` | - | `worst` / `limit`, or 2 - `worst` / `limit` if `at_least` is true; never negative |
 | `met` | - | whether the requirement is met |
 
-The requirement is met if `margin` is at most 1: 0.2 is 20 % of the limit, and 1.1 is 10 % beyond it. With a quantile,
-`margin` uses the value at the quantile instead of `worst`. For a fraction of the time, `margin` is the fraction beyond
+The requirement is met if `margin` is at most 1. A `margin` of 1.1 is 10 % beyond the limit. With a quantile, `margin`
+uses the value at the quantile instead of `worst`. For a fraction of the time, `margin` is the fraction beyond
 the limit, divided by the allowed fraction. It is null if a failed trial counts, or if the trials are too few."""
 ERRORS = """\
 With `controller.error = "additive"` the attitude error vector is eps_1 = q_1 - q_1f, as in the paper. With
@@ -96,10 +96,7 @@ The sampled loop may also have required margins, which are numbers. `gain_margin
 `delay_margin` [s] are lower limits. `peak_sensitivity` [dB] is the largest allowed peak sensitivity M_s. A table has
 these keys:"""
 
-SUITE = """\
-Any number of sensors, a table each: at least one gyro, and attitude sensors that determine the attitude together. A
-[Kalman filter](theory/sensor_suites.md) combines them. These tables replace the noise in `[hardware]` and `[filter]`,
-which are the short form for one star tracker and one gyro."""
+SUITE = sensor_tables.SUITE_MEANING.replace("Kalman filter", "[Kalman filter](theory/sensor_suites.md)")
 
 
 def scenarios() -> str:

@@ -92,14 +92,16 @@ def read(path: Path, name: str = "--runs", allowed: str = ALLOWED) -> pl.DataFra
     files = sorted(path.glob("*.parquet")) if path.is_dir() else [path]
     if not files or files[0].suffix.lower() not in (".csv", ".parquet"):
         raise RefusedError(f"{name} is {path}, but must be {allowed}")
-    tables = list[pl.DataFrame]()
+    table = None
     for file in files:
         try:
-            tables = [pl.concat([*tables, csv_tables.read_table(file)])]
+            part = csv_tables.read_table(file)
+            table = part if table is None else pl.concat([table, part])
         except (ValueError, pl.exceptions.PolarsError) as error:
             damaged = "which" if file == path else f"whose {file.name}"
             raise RefusedError(f"{name} is {path}, {damaged} cannot be read: {str(error).splitlines()[0]}") from None
-    return tables[0]
+    assert table is not None
+    return table
 
 
 def check_table(

@@ -88,12 +88,8 @@ def signals(t: np.ndarray, panels: list[tuple[str, np.ndarray, np.ndarray]]) -> 
             colour, _ = style.STYLES[k % len(style.STYLES)]
             panel.plot(t[drawn], measured[drawn, k], ".", ms=2, color=colour, alpha=0.4)
             panel.plot(t[drawn], predicted[drawn, k], "-", lw=0.9, color=colour, label=f"component {k + 1}")
-    _legend_below(figure)
+    style.legend_below(figure, columns=6)
     return figure
-
-
-def _legend_below(figure: Figure) -> None:
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower left", ncols=6)
 
 
 @style.styled
@@ -173,5 +169,5 @@ def profile(t: np.ndarray, panels: list[tuple[str, np.ndarray]]) -> Figure:
         for k, column in enumerate(values.T):
             colour, line = style.STYLES[k % len(style.STYLES)]
             panel.plot(t, column, color=colour, ls=line, label=f"component {k + 1}")
-    _legend_below(figure)
+    style.legend_below(figure, columns=6)
     return figure

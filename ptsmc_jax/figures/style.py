@@ -45,10 +45,11 @@ def new_figure(title: str, ylabel: str) -> tuple[Figure, Axes]:
 
 
 def legend_below(figure: Figure, columns: int) -> None:
-    """Add a legend below the axes of a figure with one plot, and enlarge the figure for it."""
+    """Add the legend of the first plot below the axes of a figure, and enlarge the figure for it."""
     handles, labels = figure.axes[0].get_legend_handles_labels()
     rows = -(-len(labels) // columns)
-    figure.set_size_inches(8.0, 4.5 + 0.26 * rows)
+    width, height = figure.get_size_inches()
+    figure.set_size_inches(width, height + 0.26 * rows)
     figure.legend(handles, labels, loc="outside lower left", ncols=columns, fontsize=9, frameon=False)
 
 

@@ -165,9 +165,9 @@ def build(scenario: Scenario, logs: Sequence[Measurements], names: Sequence[str]
     frequencies = [float(np.max(np.asarray(getattr(setup.plant, "frequency", [0.0]))))]
     fastest = max([*frequencies, *(term.largest_frequency() for term in scenario.terms)])
     max_step = min(interval * 1.5, 0.2 / fastest if fastest > 0.0 else np.inf)
-    free = [parameter.name for parameter in selected]
-    dispersed = (name for name in possible if getattr(scenario.dispersion, name, None) is not None)
-    return Problem(model, selected, max_step, GYRO_BIAS in names, tuple(name for name in dispersed if name not in free))
+    others = possible.keys() - {parameter.name for parameter in selected}
+    dispersed = sorted(name for name in others if getattr(scenario.dispersion, name, None) is not None)
+    return Problem(model, selected, max_step, GYRO_BIAS in names, tuple(dispersed))
 
 
 def _build_model(

@@ -25,6 +25,11 @@ from ptsmc_jax.scenario.values import Kinds, Meaning, NotNegative, Positive, Tab
 if TYPE_CHECKING:
     from ptsmc_jax.scenario.tables import Scenario
 
+SUITE_MEANING = (
+    "Any number of sensors, a table each: at least one gyro, and attitude sensors that determine the attitude "
+    "together. A Kalman filter combines them. These tables replace the noise in [hardware] and [filter], which are "
+    "the short form for one star tracker and one gyro."
+)
 MAX_LATENCY_PERIODS = 8  # control periods until a reading is used; the filter keeps an attitude for each
 Size = Annotated[float, Meta(ge=1e-15, le=1e3, description="a number from 1e-15 to 1000")]
 Sizes = Annotated[

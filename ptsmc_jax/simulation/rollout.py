@@ -89,7 +89,7 @@ class Run(NamedTuple):
     target_0: PyTree  # reference at t = 0
     target_t_f: PyTree  # reference at t_f
     singularity_distance_unit: Array  # divisor of the distance to the law's singularity, see `Kinematics`
-    uncovered_from: Array  # first time for which the clock has no samples [s]; NaN: it covers t = 0 to t_end
+    uncovered_from: Array  # first time without samples of the clock [s]; NaN: it covers t = 0 to t_end
     record: bool  # whether the history is recorded
 
 

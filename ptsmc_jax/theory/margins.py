@@ -392,7 +392,7 @@ def simultaneous_margins(loop: Loop) -> dict[str, float]:
 
     if not all(np.isfinite(v).all() for v in jax.tree.leaves(loop)) or is_unstable():
         return dict.fromkeys(FIELDS, float("nan"))
-    response, _ = _responses(loop)[1:]
+    _, response = _responses(loop)
     smallest = np.linalg.svd(np.eye(response.shape[1]) + np.asarray(response), compute_uv=False)[:, -1].min()
     decibels, degrees = np.arange(1.0, 81.0), np.arange(2.0, 181.0, 2.0)
     periods = np.unique(np.append(np.linspace(0.0, 10.0, 41)[1:], np.geomspace(10, 200, 40)))
@@ -407,12 +407,12 @@ def simultaneous_margins(loop: Loop) -> dict[str, float]:
 
 
 @programs.jit
-def _responses(loop: Loop) -> tuple[Array, Array, Array]:
-    """Return frequencies, L (points, m, m), and L of each axis with the other axes closed (points, m)."""
+def _responses(loop: Loop) -> tuple[Array, Array]:
+    """Return the frequencies (points,) [rad/s] of the grid, and L (points, m, m)."""
     opening = linear.open_at_input(loop)
     w = crossings.frequency_grid(crossings.poles_of(opening), loop.period)
     L, _ = crossings.in_schur_coordinates(opening).response(jnp.exp(1j * w * loop.period))
-    return w, L, crossings.axis_responses(L)
+    return w, L
 
 
 def responses(loop: Loop) -> tuple[np.ndarray, np.ndarray]:

@@ -210,7 +210,7 @@ def test_gain_factor_below_one_gives_the_distance_to_the_nearest_stability_limit
 @pytest.mark.parametrize(
     ("inertia", "key", "refused"),
     [
-        ([10.0, 12.0, 14.0], "spacecraft.inertia", "of which a map changes one; allowed are spacecraft.inertia[0], sp"),
+        ([10.0, 12.0, 14.0], "spacecraft.inertia", "but a map changes only one; allowed are spacecraft.inertia[0], sp"),
         ([[10.0, 0, 0], [0, 12.0, 0], [0, 0, 14.0]], "spacecraft.inertia", "such as three principal moments"),
         ([[10.0, 0, 0], [0, 12.0, 0], [0, 0, 14.0]], "spacecraft.inertia[0]", "such as three principal moments"),
     ],

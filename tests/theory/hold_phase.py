@@ -1,4 +1,4 @@
-"""Exact motion, and envelopes of s and of the error, in the hold phase, with which tests compare simulated runs.
+"""Exact motion, and envelopes of s and of the error, in the hold phase. Tests compare them with simulated runs.
 
 Read `exact_hold` first. "Exact" means a perfect disturbance estimate and K2 = 0. The envelopes hold for the continuous
 loop without noise.

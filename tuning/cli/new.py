@@ -12,7 +12,7 @@ from ptsmc_jax.scenario.attitude_keys import Attitude
 from ptsmc_jax.scenario.custom import Custom
 from ptsmc_jax.scenario.law_tables import LawTable
 from ptsmc_jax.scenario.schema import PartTable
-from ptsmc_jax.scenario.sensor_tables import SENSORS
+from ptsmc_jax.scenario.sensor_tables import SENSORS, SUITE_MEANING
 from ptsmc_jax.scenario.tables import Scenario, Tune
 from ptsmc_jax.scenario.values import Table
 from ptsmc_jax.simulation import catalogues
@@ -94,10 +94,6 @@ EXAMPLES: dict[str, Any] = {
     "identify.torque_walk": 1e-6,
 }
 REQUIREMENTS = {"window_error": {"limit": 1e-4, "quantile": 0.9973, "confidence": 0.9}, "peak_torque": 0.5}
-SENSOR_LIST = (
-    "Any number of sensors, a table each: at least one gyro, and attitude sensors that determine the attitude "
-    "together. They replace the noise of [hardware] and [filter], the short form for one star tracker and one gyro."
-)
 INTRODUCTION = """\
 A scenario for ptsmc. Every key is optional: an absent key has the value shown here. Tables that are off, like
 #[hardware], stay off. To use a line such as #delay = 1, remove its # and the # of its table. Units are in brackets.
@@ -137,7 +133,6 @@ class _ScenarioFile:
             yield from _comment_lines(keys.description(struct))
         yield f"{'#' if stated is None else ''}[{name}]"
         yield from self.kind_lines(name, kind, struct, stated, values)
-        yield from self.custom_lines(struct, stated, values)
         if issubclass(struct, Attitude) and name != "initial":
             yield from _comment_lines("its attitude by one of the keys of [initial]")
         for other, alternative in kinds.items():
@@ -147,14 +142,13 @@ class _ScenarioFile:
 
     def sensor_list_lines(self) -> Iterator[str]:
         """Return the lines of the sensors of the scenario, then of the other kinds of sensors as comments."""
-        yield from _comment_lines(SENSOR_LIST)
+        yield from _comment_lines(SUITE_MEANING)
         stated = self.stated_tables.get("sensors")
         sensors = list(zip(stated, self.values["sensors"], strict=True)) if isinstance(stated, list) else []
         for keys_given, values in sensors:
             yield from ("", "[[sensors]]")
             kind = values["kind"]
             yield from self.kind_lines("sensors", kind, SENSORS[kind], keys_given, values)
-            yield from self.custom_lines(SENSORS[kind], keys_given, values)
         for kind in (kind for kind in SENSORS if kind not in {values["kind"] for _, values in sensors}):
             yield from ("", "#[[sensors]]")
             yield from self.kind_lines("sensors", kind, SENSORS[kind], None, {})
@@ -184,15 +178,10 @@ class _ScenarioFile:
             elif not (is_off and key.name in explained_before):
                 value = values[key.name] if key.name in values else self.example_value(name, kind, key)
                 yield from _key_lines(is_off, key.name, value, _describe_key(key))
-
-    def custom_lines(
-        self, struct: type[Table], stated: Mapping[str, object] | None, values: Mapping[str, object]
-    ) -> Iterator[str]:
-        """Return the lines of the fields of a custom class."""
         if issubclass(struct, Custom):
-            for key in stated or ():
-                if key not in ("kind", *struct.__struct_fields__):
-                    yield from _key_lines(False, key, values[key], "custom")
+            for name in stated or ():
+                if name not in ("kind", *struct.__struct_fields__):
+                    yield from _key_lines(False, name, values[name], "custom")
 
     def inline_lines(
         self, name: str, key: keys.Key, chosen: Mapping[str, object], kinds: layouts.Kinds

@@ -60,8 +60,9 @@ def run_in_lockstep(
             changed.put(None)
 
     running, started, failure = set[int](), 0, None
+    threads = range(min(width, len(functions)))
     try:
-        for _ in range(min(width, len(functions))):
+        for _ in threads:
             threading.Thread(target=work, daemon=True).start()
         while True:
             try:
@@ -91,7 +92,7 @@ def run_in_lockstep(
                 answers.update(dict.fromkeys(requests, failure))
                 requests.clear()
     finally:
-        for _ in range(min(width, len(functions))):
+        for _ in threads:
             waiting.put(None)
     if failure is not None:
         raise failure

@@ -218,7 +218,7 @@ def _with_keys(scenario: Scenario, values: dict[str, float]) -> Scenario:
                 raise ScenarioError(f"{table}.{name} has rows of numbers, but a map changes only {allowed}")
             if is_inertia and not number:
                 allowed = ", ".join(f"{key}[{k}]" for k in range(len(current)))
-                raise ScenarioError(f"{key} has three moments, of which a map changes one; allowed are {allowed}")
+                raise ScenarioError(f"{key} has three moments, but a map changes only one; allowed are {allowed}")
             new_value = [value if not number or k == int(number) else element for k, element in enumerate(current)]
         changes[f"{table}__{name}"] = new_value
     if "loop.t_end" not in values and {"controller.t_f", "loop.window"} & set(values):  # keep t_end - t_f
