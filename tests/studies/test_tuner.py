@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from ptsmc_jax import scenario
-from ptsmc_jax.numerics import draws
 from ptsmc_jax.scenario.tables import objective_name
 from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import FIRST_FLIGHT, ROOT, SHORT_CHAIN, small_search
@@ -20,15 +19,6 @@ from tuning.search.local_searches import Step
 from tuning.studies import judging, posing, tune_files, tuner
 
 LIMIT = 0.6  # on the peak torque
-
-
-@pytest.mark.parametrize("seed", [0, 1000, 654735429, 2933870671, 188629158])
-def test_seeds_of_held_out_trials_differ_from_each_other_and_from_the_search(seed):
-    """The hash maps one seed to itself, and another one in each later turn. The parameters include these seeds."""
-    seeds = [seed, *(judging.derive_held_out_seed(seed, turn) for turn in range(tuner.TRIES))]
-    assert len(set(seeds)) == len(seeds)
-    plain = [draws.derive(seed, name) for name in ("fresh trials", "fresh trials 1", "fresh trials 2")]
-    assert (seeds[1:] == plain) == (seed not in plain)
 
 
 @pytest.fixture

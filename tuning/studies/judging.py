@@ -21,17 +21,13 @@ from tuning.search import confirm, gains, trust
 
 
 def derive_held_out_seed(seed: int, turn: int = 0) -> int:
-    """Return the seed of the held-out trials, which differs from the seed of the search.
-
-    The hash of `draws.derive` maps one seed in 2^32 to itself for each name, for example 654735429 in turn 0.
+    """Return the seed of the held-out trials.
 
     Args:
         seed: seed of the search.
         turn: number of earlier searches whose gains broke a limit on their held-out trials.
     """
-    name = f"fresh trials {turn}" if turn else "fresh trials"
-    held_out = draws.derive(seed, name)
-    return held_out if held_out != seed else draws.derive(seed, f"{name}, others")
+    return draws.derive(seed, f"fresh trials {turn}" if turn else "fresh trials")
 
 
 def reference_scenarios(scenario: Scenario) -> tuple[dict[str, Scenario], str | None]:
