@@ -101,8 +101,7 @@ def montecarlo(
     this_shard = _parse_shard(shard)
     tls_files = {"tls_ca_file": tls_ca, "tls_client_cert": tls_cert, "tls_client_key": tls_key}
     tls = {name: str(path) for name, path in tls_files.items() if path is not None}
-    has_stop_width, on_cluster = until_confident is not None, cluster is not None
-    is_partial = this_shard != (1, 1) or dry_run
+    on_cluster, is_partial = cluster is not None, this_shard != (1, 1) or dry_run
     for is_refused, message in (
         (tls and not on_cluster, "--tls-ca, --tls-cert and --tls-key need --cluster"),
         (
@@ -123,7 +122,7 @@ def montecarlo(
     from ptsmc_jax.campaigns import store
     from ptsmc_jax.simulation import catalogues
 
-    if has_stop_width and set(loaded.requirements) <= set(catalogues.MARGINS):
+    if until_confident is not None and set(loaded.requirements) <= set(catalogues.MARGINS):
         raise UsageError("--until-confident needs [requirements] on metrics in the scenario")
     from tuning.studies import campaign_folder
 
@@ -142,10 +141,6 @@ def montecarlo(
     )  # fmt: skip
     if scenario is not None:
         searches.warn_about_seed(scenario, seed)
-    if has_stop_width:
-        from tuning.studies import campaign_summary
-
-        folder = replace(folder, first_look=campaign_summary.choose_first_look(folder, common.force))
     _ = folder.campaign  # raises configuration errors before anything is written
     if folder.parameter_differences:
         print(f"ptsmc: {folder.parameter_differences}", file=sys.stderr)

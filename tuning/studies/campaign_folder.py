@@ -52,7 +52,6 @@ class CampaignVersions(msgspec.Struct, frozen=True):
     metrics_names: tuple[str, ...] | None = None
     run_table: str | None = None  # file name of the run table
     controller_otherwise: str | None = None  # parameters of C code that differ from the scenario, in words
-    first_look: Annotated[int, Meta(ge=1, le=2**32)] | None = None
 
 
 @dataclass(frozen=True)
@@ -71,7 +70,6 @@ class Folder:
     table_name: str | None = None  # file name of the run table
     table: pl.DataFrame | None = None  # content of the run table
     controller: Path | None = None  # folder of the C code that controls; None: the simulated law controls
-    first_look: int | None = None  # number of trials before the first check of `--until-confident`; None: one part
 
     @cached_property
     def custom_code(self) -> dict[str, str]:
@@ -103,8 +101,7 @@ class Folder:
     def versions(self) -> dict[str, object]:
         """The content of `versions.json`."""
         names = None if self.custom_metrics is None else self.custom_metric_names
-        counts = {"trials": self.trials, "first_look": self.first_look}
-        entries = {**self.identity, **counts, "metrics_names": names, "run_table": self.table_name}
+        entries = {**self.identity, "trials": self.trials, "metrics_names": names, "run_table": self.table_name}
         if self.controller is not None:
             entries |= {C_FOLDER: C_FOLDER, "controller_otherwise": self.parameter_differences or None}
         return store.versions(**{name: value for name, value in entries.items() if value is not None})
@@ -357,7 +354,6 @@ def open_folder(path: Path) -> Folder:
         table_name=stored.run_table,
         table=None if stored.run_table is None else run_tables.read(path / TABLE, "the run table"),
         controller=path / C_FOLDER if custom.checksum_name(custom_parts.CONTROLLER) in checksums else None,
-        first_look=stored.first_look,
     )
 
 
@@ -422,6 +418,6 @@ def write_run_table(folder: Folder, report: Callable[[Tally], None]) -> None:
 
 def write_trial_count(folder: Folder, trials: int) -> Folder:
     """Return the campaign with this final number of trials, and write the number to `versions.json`."""
-    final = replace(folder, trials=trials, first_look=None)
+    final = replace(folder, trials=trials)
     store.write_json(folder.path / "versions.json", final.versions)
     return final

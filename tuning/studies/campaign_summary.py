@@ -22,29 +22,13 @@ from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.requirements import Requirement, Verdict, must_keep
 from ptsmc_jax.simulation.rollout import STATUS
 from tuning.studies import campaign_theory
-from tuning.studies.campaign_folder import Folder, open_folder
+from tuning.studies.campaign_folder import Folder
 
 TOLERANCE = 1e-12  # largest relative difference of equal results
 CONFIDENCE = 0.95  # confidence level of the intervals, unless a requirement has its own
 QUANTILES = (0.5, 0.9, 0.99, 0.9973)
 BUDGET_FRACTION = 0.9973  # fraction of the runs that keep a pointing budget: three sigma of a normal distribution
 DRIVER_TRIALS = 100_000  # largest number of trials for the sensitivities to inputs
-
-
-def choose_first_look(folder: Folder, force: bool) -> int | None:
-    """Return the number of trials before `until_confident` first checks the intervals; None: one part.
-
-    A finished campaign that is extended is first checked with all its trials. An interrupted campaign keeps its first
-    check when it resumes, and so stops after the same number of trials as without the interruption.
-    """
-    try:
-        earlier = None if force else open_folder(folder.path)
-    except RefusedError:  # the folder has no campaign yet
-        earlier = None
-    if earlier is None:
-        return None
-    finished = earlier.trials < folder.trials and _count_existing_trials(earlier) >= earlier.trials
-    return earlier.trials if finished else earlier.first_look
 
 
 def until_confident(folder: Folder, width: float, simulate_first: Callable[[int], None]) -> int:
@@ -61,7 +45,7 @@ def until_confident(folder: Folder, width: float, simulate_first: Callable[[int]
     Returns:
         The number of trials.
     """
-    count, existing = folder.first_look or running.PART, _count_existing_trials(folder)
+    count, existing = running.PART, sum(part.count for part in folder.rows.parts()[0])
     while count < existing:  # so that the first check uses all existing trials
         count *= 2
     while True:
@@ -72,10 +56,6 @@ def until_confident(folder: Folder, width: float, simulate_first: Callable[[int]
         if count == folder.trials or all(w <= width for w in widths):
             return count
         count *= 2
-
-
-def _count_existing_trials(folder: Folder) -> int:
-    return sum(part.count for part in folder.rows.parts()[0])
 
 
 def judge_requirements(folder: Folder, count: int | None = None) -> list[dict[str, Any]]:
