@@ -9,12 +9,12 @@ import sys
 import time
 
 import numpy as np
-import polars as pl
 import pytest
 
-from tests.helpers import QUICKLY, ROOT, SHORT_CHAIN, same
+from tests.helpers import QUICKLY, ROOT, SHORT_CHAIN, rows_of, same
 
 PTSMC = [sys.executable, "-c", "from tuning.cli.main import main; main()"]
+RESULTS = "out/montecarlo-s"
 COMMAND = ["montecarlo", "s.toml", "--seed", "3", "--no-figures", "--quiet"]
 PARTS, TRIALS = 4, 4 * 4096 - 1000
 # long enough for a kill during the simulation
@@ -36,12 +36,8 @@ def ended(run, seconds=300):
     return run.returncode, error
 
 
-def parts(folder, out="out/montecarlo-s"):
-    return sorted(path.name for path in (folder / out / "trials").glob("0*.parquet"))
-
-
-def rows_of(folder, out="out/montecarlo-s"):
-    return pl.concat([pl.read_parquet(folder / out / "trials" / name) for name in parts(folder, out)])
+def parts(folder):
+    return sorted(path.name for path in (folder / RESULTS / "trials").glob("*.parquet"))
 
 
 # A limit on the file size imitates a full disk: no part and no compile cache fits. The second call has no limit.
@@ -70,7 +66,7 @@ def whole(tmp_path_factory):
     last = run.stderr.strip().splitlines()[-1]
     assert re.fullmatch(r"ptsmc: File too large.*", last)
     assert "Traceback" not in run.stderr
-    rows = rows_of(folder)
+    rows = rows_of(folder / RESULTS)
     assert rows["trial"].to_list() == list(range(TRIALS))
     return rows
 
@@ -81,11 +77,11 @@ def folder(tmp_path):
     return tmp_path
 
 
-def await_parts(folder, count, run, patience=120.0, out="out/montecarlo-s"):
+def await_parts(folder, count, run, patience=120.0):
     """Wait for this number of parts, and return whether the process still runs."""
     since = time.monotonic()
     while run.poll() is None:
-        if len(parts(folder, out)) >= count:
+        if len(parts(folder)) >= count:
             return True
         assert time.monotonic() - since < patience
         time.sleep(0.002)
@@ -109,40 +105,14 @@ def test_campaign_killed_at_random_times_ends_with_the_same_rows(folder, request
             break
         if len(parts(folder)) > PARTS - 3:  # too few missing parts for another kill, so delete some
             for name in parts(folder)[: PARTS // 2]:
-                (folder / "out/montecarlo-s/trials" / name).unlink()
+                (folder / RESULTS / "trials" / name).unlink()
     assert killed == times
     run = started(folder, "--trials", str(TRIALS))
     assert ended(run) == (0, "")
-    assert list((folder / "out/montecarlo-s/trials").glob(".making*")) == []
-    rows = rows_of(folder)
+    assert list((folder / RESULTS / "trials").glob(".making*")) == []
+    rows = rows_of(folder / RESULTS)
     assert rows["trial"].to_list() == list(range(TRIALS))  # no trial is missing or repeated
     same(rows, request.getfixturevalue("whole"))  # evaluated last, so that it can use the compile cache
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("options", [((), ()), (("--shard", "1/2"), ("--shard", "2/2"))], ids=["same", "shards"])
-def test_two_processes_killed_in_one_folder_lose_no_row(folder, whole, options):
-    """Shards run at the same time. Of two equal commands, the later one is refused. Both are killed three times."""
-    rng, codes = np.random.default_rng(1), set()
-    for _ in range(3):
-        before = len(parts(folder))
-        runs = [started(folder, "--trials", str(TRIALS), *option, start_new_session=True) for option in options]
-        await_parts(folder, before + 1, runs[0])
-        time.sleep(rng.uniform(0.0, 0.06))
-        for run in runs:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(run.pid, signal.SIGKILL)
-        for run in runs:
-            code, error = ended(run)
-            codes.add(code)
-            assert not error or "is in use" in error
-        for name in parts(folder)[1:]:
-            (folder / "out/montecarlo-s/trials" / name).unlink()
-    assert -signal.SIGKILL in codes
-    for option in sorted(set(options)):
-        assert ended(started(folder, "--trials", str(TRIALS), *option)) == (0, "")
-    same(rows_of(folder), whole)
-    assert [path.name for path in (folder / "out").iterdir()] == ["montecarlo-s"]
 
 
 @pytest.fixture
@@ -172,7 +142,7 @@ def test_cluster_that_loses_a_worker_gives_the_same_rows(folder, whole, cluster)
     assert await_parts(folder, 2, run)
     cluster[0].kill()
     assert ended(run) == (0, "")
-    rows = rows_of(folder)
+    rows = rows_of(folder / RESULTS)
     assert rows["trial"].to_list() == list(range(TRIALS))
     same(rows, whole)
     assert [worker.poll() is None for worker in cluster] == [False, True]

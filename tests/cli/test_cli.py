@@ -3,11 +3,9 @@
 import csv
 import json
 import os
-import re
 import shutil
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -361,54 +359,6 @@ def test_interrupted_search_writes_its_best_gains_and_resumes(command, tmp_path,
     for summary in (one, other):
         summary["search"].pop("seconds")
     assert one == other
-
-
-@pytest.mark.long
-def test_killed_search_resumes(tmp_path):
-    """Kill a search in its own process, then run the same command to its end."""
-    (tmp_path / "s.toml").write_text(SHORT)
-    code = (
-        "import sys; from tuning.cli import main; "
-        "from tuning.search import confirm, evolution, local_searches, starts, worst; "
-        "starts.CANDIDATES = 16; local_searches.SOBOL_POINTS = 16; evolution.GENERATIONS = 3; "
-        "worst.SCREENED = 48; confirm.HELD_OUT = 40; main.main()"
-    )
-    run = [sys.executable, "-c", code, "tune", "s.toml", "--out", "t", "--quiet", "--no-figures"]
-    journal = tmp_path / "t" / "journal.bin"
-    quickly = os.environ | {"XLA_FLAGS": QUICKLY}
-    process = subprocess.Popen(run, cwd=tmp_path, env=quickly)
-    while process.poll() is None and (not journal.exists() or journal.stat().st_size == 0):
-        time.sleep(0.02)
-    assert process.poll() is None, "it was done before it could be killed"
-    process.kill()
-    process.wait()
-    assert not (tmp_path / "t" / "summary.json").exists()
-    done = subprocess.run(run, cwd=tmp_path, env=quickly, capture_output=True, text=True, check=False)
-    assert done.returncode in (0, 1), done.stderr
-    assert not journal.exists()
-    whole = subprocess.run([*run[:-3], "w", *run[-2:]], cwd=tmp_path, env=quickly, check=False)
-    assert whole.returncode == done.returncode
-    assert (tmp_path / "t" / "tuned.toml").read_text() == (tmp_path / "w" / "tuned.toml").read_text()
-    assert (tmp_path / "t" / "history.csv").read_text() == (tmp_path / "w" / "history.csv").read_text()
-
-
-@pytest.mark.long
-def test_infeasible_limit_is_reported(command, tmp_path, monkeypatch):
-    small_search(monkeypatch)
-    text = re.sub(r"peak_torque = .*", "peak_torque = 0.01", SHORT)
-    (tmp_path / "s.toml").write_text(text)
-    status, told, _ = command("tune", "s.toml", "--out", "t", "--no-figures")
-    summary = json.loads((tmp_path / "t" / "summary.json").read_text())
-    assert (status, summary["status"]) == (1, "not met")
-    ratio = summary["search"]["largest_over_limit"]["peak_torque"]
-    assert ratio > 1.0
-    assert summary["search"]["rounds_with_harder_trials"] == 0  # more trials cannot make the problem feasible
-    assert "the search found no gains that meet every requirement, nor did a global search" in told
-    assert f"peak_torque reaches {ratio:.3g} times its limit of 0.01 N m on the training trials" in told
-    assert list(summary["search"]["conflict"]) == ["peak_torque"]
-    assert "peak_torque at most 0.01 N m: worst" in told
-    # the best compromise has the smallest torque within the bounds, which is at the smallest eta
-    assert 2.6 <= summary["gains"]["eta"] < 2.8  # bounds: 2.6 to 3.05
 
 
 @pytest.mark.parametrize(
