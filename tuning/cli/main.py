@@ -1,7 +1,6 @@
 """The `ptsmc` command. Commands that compute import JAX after they have checked their arguments."""
 
 import dataclasses
-import functools
 import io
 import sys
 from pathlib import Path
@@ -314,14 +313,13 @@ def compare(
     rivals.check()
     comparing.check(loaded)
     loaded = posing.with_tune(loaded)
-    validated = functools.cache(lambda: comparing.validated_contenders(loaded, rivals))
+    contenders = comparing.validated_contenders(loaded, rivals)
     identity = comparing.identity(loaded, seed, rivals) | {"device": device}
     search = searches.LongSearch(
         identity,
         objective_name(loaded.search),
-        work=lambda report, journal: comparing.compare(loaded, seed, report, journal, validated()),
+        work=lambda report, journal: comparing.compare(loaded, seed, report, journal, contenders),
         write=lambda staging, comparison: comparing.write(staging, loaded, comparison, common.figures, identity),
-        check=validated,
     )
     return searches.run(search, loaded, folder, force=common.force, quiet=common.quiet)
 
