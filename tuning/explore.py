@@ -25,7 +25,6 @@ from tuning.studies import (
     campaign_figures,
     campaign_folder,
     campaign_summary,
-    campaign_theory,
     posing,
     reproduction,
     stability,
@@ -286,9 +285,7 @@ def montecarlo(
     _ = target.campaign  # raises ScenarioError before anything is written
     with store.lock_folder(path):
         campaign_folder.begin(target, force=False)
-        campaign_theory.prepare(target)
         campaign_folder.simulate(target, (1, 1), lambda tally: None)
-        campaign_theory.write_missing(target)
     return Campaign(target)
 
 

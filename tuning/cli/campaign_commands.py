@@ -3,6 +3,7 @@
 import contextlib
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -124,7 +125,7 @@ def montecarlo(
 
     if until_confident is not None and set(loaded.requirements) <= set(catalogues.MARGINS):
         raise UsageError("--until-confident needs [requirements] on metrics in the scenario")
-    from tuning.studies import campaign_folder
+    from tuning.studies import campaign_folder, campaign_summary
 
     table = None
     if runs is not None:
@@ -152,10 +153,14 @@ def montecarlo(
     ):
         campaign_folder.begin(folder, common.force)
         with CampaignProgress(common.quiet) as report:
+            simulate = partial(campaign_folder.simulate, folder, this_shard, report, workers)
             if dry_run:
                 campaign_folder.write_run_table(folder, report)
+            elif until_confident is None:
+                simulate()
             else:
-                folder = _simulate_shard(folder, this_shard, report, workers, until_confident)
+                count = campaign_summary.until_confident(folder, until_confident, simulate)
+                folder = campaign_folder.write_trial_count(folder, count)
         if not is_partial:
             return _summarise(folder, common.quiet, common.figures)
     if dry_run and not common.quiet:
@@ -178,28 +183,6 @@ def _connect_cluster(cluster: str | None, tls: dict[str, str]) -> "contextlib.Ab
     from ptsmc_jax.campaigns import cluster as clusters
 
     return contextlib.closing(clusters.connect(cluster, tls))
-
-
-def _simulate_shard(
-    folder: "Folder",
-    this_shard: tuple[int, int],
-    report: CampaignProgress,
-    workers: "Cluster | None",
-    width: float | None,
-) -> "Folder":
-    """Simulate a shard of a campaign; width: value of --until-confident, or None."""
-    from tuning.studies import campaign_folder, campaign_summary, campaign_theory
-
-    campaign_theory.prepare(folder)
-    if width is None:
-        campaign_folder.simulate(folder, this_shard, report, workers)
-    else:
-        trial_count = campaign_summary.until_confident(
-            folder, width, lambda first: campaign_folder.simulate(folder, this_shard, report, workers, first)
-        )
-        folder = campaign_folder.write_trial_count(folder, trial_count)
-    campaign_theory.write_missing(folder)
-    return folder
 
 
 def summarize(folder: CampaignFolder, /, *, quiet: Quiet = False, figures: Figures = True) -> int:

@@ -33,9 +33,9 @@ from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.computer import PYTHON_SOFTWARE, Software
 from tuning.search import custom_parts
+from tuning.studies import campaign_theory
 
 C_FOLDER = "controller"  # subfolder with the C code of the controller, if C code controls the simulated spacecraft
-THEORY = "theory.json"  # lower bound and margins, see `campaign_theory`
 TABLE = "run_table.parquet"  # the run table; `--dry-run` writes a folder instead
 RUN_TABLE = "run_table_sha256"  # key of the checksum of the run table in `versions.json`
 CUSTOM = f"{systems.NAME_FORMS}, a function of a run's Result and its Parts that returns named numbers"
@@ -275,7 +275,7 @@ def begin(folder: Folder, force: bool) -> None:
     if force and path.is_dir():
         for stored_rows in (folder.rows, folder.dry_run_rows):
             stored_rows.tidy(())
-        for name in (THEORY, *([TABLE] if RUN_TABLE in versions else [])):
+        for name in (campaign_theory.FILE, *([TABLE] if RUN_TABLE in versions else [])):
             (path / name).unlink(missing_ok=True)
     elif _contains_campaign(folder, tables):
         return
@@ -377,7 +377,9 @@ def simulate(
     simulate_remotely: Callable[[Folder, list[Block]], Iterator[tuple[Part, int]]] | None = None,
     trials: int | None = None,
 ) -> None:
-    """Simulate the missing trials. Damaged parts are reported, renamed and simulated again.
+    """Simulate the missing trials, and compute their lower bound and margins if these are missing.
+
+    Damaged parts are reported, renamed and simulated again.
 
     Args:
         folder: the campaign.
@@ -386,6 +388,7 @@ def simulate(
         simulate_remotely: simulates parts on other machines; None: this process simulates them.
         trials: simulate only the first trials up to this number; None: all of them.
     """
+    campaign_theory.prepare(folder)
     trials = folder.trials if trials is None else trials
     parts, broken = folder.rows.parts()
     for path in broken:
@@ -405,6 +408,7 @@ def simulate(
     running.report_progress(finished_parts, running.count_progress(parts, trials, blocks), report)
     if is_only_writer:
         folder.rows.tidy(folder.rows.parts()[0])
+    campaign_theory.write_missing(folder)
 
 
 def write_run_table(folder: Folder, report: Callable[[Tally], None]) -> None:

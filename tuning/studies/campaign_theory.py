@@ -4,19 +4,22 @@
 this file.
 """
 
-import json
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ptsmc_jax.campaigns import margin_verdicts, runs, store
 from ptsmc_jax.dispersions.variation import Row
 from ptsmc_jax.simulation import catalogues
-from tuning.studies.campaign_folder import THEORY, Folder
+
+if TYPE_CHECKING:
+    from tuning.studies.campaign_folder import Folder
+
+FILE = "theory.json"
 
 
-def write_missing(folder: Folder) -> None:
+def write_missing(folder: "Folder") -> None:
     """Write `theory.json` if it is missing, incomplete or damaged.
 
     It has the lower bound of the RMS window error, and the verdicts on the required stability margins.
@@ -28,36 +31,33 @@ def write_missing(folder: Folder) -> None:
         verdicts = margin_verdicts.judge_trials(ready, folder.seed, _rows_with_margins(folder))
         lower_bound = runs.rms_lower_bound(ready, folder.seed, first_rows)
         theory = {"lower_bound": lower_bound, "margins": [verdict.in_summary() for verdict in verdicts]}
-        store.write_json(folder.path / THEORY, theory)
+        store.write_json(folder.path / FILE, theory)
 
 
-def prepare(folder: Folder) -> None:
+def prepare(folder: "Folder") -> None:
     """Start to compile the programs of `write_missing` in the background, while the trials are simulated."""
     if _lacks_theory(folder):
         margin_verdicts.prepare(folder.campaign.ready, _rows_with_margins(folder))
         runs.prepare(folder.campaign.ready)
 
 
-def _lacks_theory(folder: Folder) -> bool:
+def _lacks_theory(folder: "Folder") -> bool:
     theory = read(folder)
     return "lower_bound" not in theory or bool(margins_without_verdict(folder, theory))
 
 
-def _rows_with_margins(folder: Folder) -> np.ndarray | Row | None:
+def _rows_with_margins(folder: "Folder") -> np.ndarray | Row | None:
     """Return the rows of the run table whose margins are computed, or None without a run table."""
     table = folder.campaign.run_table
     return None if table is None else table.rows(np.arange(min(margin_verdicts.TRIALS, table.count)), folder.seed)
 
 
-def margins_without_verdict(folder: Folder, theory: Mapping[str, Any]) -> list[str]:
+def margins_without_verdict(folder: "Folder", theory: Mapping[str, Any]) -> list[str]:
     """Return the required margins without a verdict: the campaign was interrupted, or `theory.json` is damaged."""
     judged = {verdict["metric"] for verdict in theory.get("margins", [])}
     return [name for name in catalogues.MARGINS if name in folder.scenario.requirements and name not in judged]
 
 
-def read(folder: Folder) -> dict[str, Any]:
+def read(folder: "Folder") -> dict[str, Any]:
     """Return the content of `theory.json`: "lower_bound" and "margins". It is empty if the file cannot be read."""
-    try:
-        return dict(json.loads((folder.path / THEORY).read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError):
-        return {}
+    return store.read_json(folder.path / FILE)
