@@ -16,12 +16,12 @@ from tuning.search.evaluate import Evaluator, MeasurementWithGradients
 class Valley(Evaluator):
     """Rosenbrock function F = (x0 - 0.2)^2 + 100 (x1 - x0^2)^2 without limits. x2 has no effect. Points are counted."""
 
-    def measure_with_gradients(self, problem, normalised):
-        self.gradients += len(normalised)
+    def _answer(self, problem, normalised, *, with_gradients):
         x0, x1, _ = normalised.T
         f, c = (x0 - 0.2) ** 2 + 100 * (x1 - x0**2) ** 2, np.full((len(normalised), 0, 8), -1.0)
         slope = np.stack([2 * (x0 - 0.2) - 400 * x0 * (x1 - x0**2), 200 * (x1 - x0**2), 0.0 * x0], axis=1)
-        return MeasurementWithGradients(normalised, f, c, f, slope, np.zeros((*c.shape, 3)))
+        values = {"gains": normalised, "f": f, "c": c, "value": f}
+        return values | ({"f_gradient": slope, "c_gradient": np.zeros((*c.shape, 3))} if with_gradients else {})
 
 
 THREE = normalisation.Bounds(("eta", "k1", "sign_width"), (2.05, 0.1, 1e-5), (6.0, 50.0, 1e-1))
@@ -38,10 +38,21 @@ def test_a_longer_local_search_continues_a_shorter_one_from_the_same_point():
                 partial(evaluate.measure_with_gradients, problem()), best, start, steps, kept.append
             )
         ends.append((best.f, best.normalised.tolist(), [float(one.f[0]) for one in kept]))
-        counts.append(evaluate.gradients)
+        counts.append(evaluate.gradients // problem().trials.size)
     assert ends[0] == ends[1]
     assert counts[0] == counts[1] > 7
     assert ends[0][0] < 1e-3
+
+
+def test_a_local_search_from_the_same_point_of_the_same_problem_simulates_and_records_nothing():
+    """With few steps, a search often ends at its starting point, and the next search begins there too."""
+    evaluate, some = Valley(THREE), replace(problem(), names=THREE.names)
+    run = local_searches.LocalSearches(evaluate, 0.0, 6, np.random.default_rng(0))
+    counts = []
+    for one in (some, some, replace(some, averaged=7)):
+        run._search(one, 0, local_search.Start(np.array([0.9, 0.1, 0.5])), 6)
+        counts.append((evaluate.gradients // some.trials.size, len(run.history)))
+    assert counts == [(6, 3), (6, 3), (12, 3)]
 
 
 def test_hand_over_is_moved_to_samples_by_delta_and_by_t_f_if_both_are_free():

@@ -67,6 +67,8 @@ class Evaluator:
     def __init__(self, bounds: Bounds, journal: Journal | None = None):
         self.bounds, self._journal = bounds, journal or Journal()
         self.rollouts, self.gradients = 0, 0  # number of rollouts without and with gradients
+        # measurements with gradients by point, of the problem that was measured last
+        self._known_problem, self._known = b"", dict[bytes, MeasurementWithGradients]()
 
     def continue_counts(self, other: "Evaluator") -> None:
         """Continue the counts of an evaluator of the same scenario with other bounds."""
@@ -78,9 +80,20 @@ class Evaluator:
         return Measurement(**self._answer(problem, normalised, with_gradients=False))
 
     def measure_with_gradients(self, problem: Problem, normalised: np.ndarray) -> MeasurementWithGradients:
-        """Return F, constraints and objective with gradients at points, (points, gains) normalised gains."""
-        self.gradients += len(normalised) * problem.trials.size
-        return MeasurementWithGradients(**self._answer(problem, normalised, with_gradients=True))
+        """Return F, constraints and objective with gradients at points, (points, gains) normalised gains.
+
+        Points that were measured since the problem last changed are not simulated again.
+        """
+        encoded, keys = _encode_request(b"", problem, normalised[:0]), [point.tobytes() for point in normalised]
+        if encoded != self._known_problem:
+            self._known_problem, self._known = encoded, {}
+        new = [k for k, key in enumerate(keys) if key not in self._known]
+        if new:
+            self.gradients += len(new) * problem.trials.size
+            measured = MeasurementWithGradients(**self._answer(problem, normalised[new], with_gradients=True))
+            self._known |= {keys[k]: measured.at(place) for place, k in enumerate(new)}
+        known = [vars(self._known[key]) for key in keys]
+        return MeasurementWithGradients(**{name: np.concatenate([one[name] for one in known]) for name in known[0]})
 
     def _answer(self, problem: Problem, normalised: np.ndarray, *, with_gradients: bool) -> dict[str, np.ndarray]:
         """Return the fields of a measurement by name, from the journal or from new simulations."""

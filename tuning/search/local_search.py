@@ -102,8 +102,6 @@ class Start:
     normalised: np.ndarray  # (gains,)
     scale: float = BOLD  # scaling of the variables, see `BOLD` and `CAREFUL`
     fixed: Sequence[int] = ()  # indices of gains that are not changed
-    # measurements of a shorter search from the same starting point, which a longer search reuses
-    measurements: dict[bytes, MeasurementWithGradients] = field(default_factory=dict)
 
 
 class _FeasibleError(Exception):
@@ -171,6 +169,7 @@ class _LocalSearch:
     on_accepted: Callable[[MeasurementWithGradients], None]
     tolerance: float
     steepest: float
+    measurements: dict[bytes, MeasurementWithGradients] = field(default_factory=dict)
 
     @property
     def bounds(self) -> list[tuple[float, float]]:
@@ -181,14 +180,13 @@ class _LocalSearch:
     def at(self, scaled: np.ndarray) -> MeasurementWithGradients:
         """Return the measurement at a point. A point is measured once."""
         key, point = scaled.tobytes(), np.clip(scaled / self.start.scale, 0.0, 1.0)[None]
-        measurements = self.start.measurements
-        if key not in measurements:
-            if len(measurements) == self.steps:
+        if key not in self.measurements:
+            if len(self.measurements) == self.steps:
                 raise _StepLimitError
-            measurements[key] = self.measure(point)
-        if measurements[key].finite[0]:
-            self.best.offer(point, measurements[key])
-        return measurements[key]
+            self.measurements[key] = self.measure(point)
+        if self.measurements[key].finite[0]:
+            self.best.offer(point, self.measurements[key])
+        return self.measurements[key]
 
     def violation(self, scaled: np.ndarray) -> float:
         """Return the largest c of the completed trials."""
@@ -256,8 +254,8 @@ class _LocalSearch:
     def _report_accepted(self, scaled: np.ndarray) -> None:
         """Call `on_accepted` with the measurement at a point that SLSQP has accepted."""
         key = np.ascontiguousarray(scaled).tobytes()
-        if key in self.start.measurements:
-            self.on_accepted(self.start.measurements[key])
+        if key in self.measurements:
+            self.on_accepted(self.measurements[key])
 
 
 def _compress(measured: MeasurementWithGradients, steepest: float) -> tuple[np.ndarray, np.ndarray]:

@@ -62,6 +62,11 @@ class Step:
     worst: np.ndarray  # (requirements,) largest metric / limit; infinite if a trial fails
 
 
+def _is_equal(one: Step, other: Step) -> bool:
+    pairs = zip(vars(one).values(), vars(other).values(), strict=True)
+    return all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
+
+
 def _few_trials(problem: Problem) -> Problem:
     """Return the problem with few averaged trials, for the first searches."""
     return fewer_trials(problem, max(FEWEST_AVERAGED, FIRST_TRIALS - (problem.trials.size - problem.averaged)))
@@ -226,10 +231,7 @@ class LocalSearches:
             scalings: scalings of the variables, `BOLD` or `CAREFUL`, which the local searches use in turn.
             replace_best: replace the best point so far by the first result, because the problem has changed.
         """
-        contenders = {
-            k: (Start(normalised, scalings[k % len(scalings)]), list(self._history.get(k, ())))
-            for k, normalised in starts.items()
-        }
+        contenders = {k: Start(normalised, scalings[k % len(scalings)]) for k, normalised in starts.items()}
         ranked = list(starts)
         for count, steps in stages:
             self._search_in_lockstep(
@@ -245,22 +247,18 @@ class LocalSearches:
     def _search_in_lockstep(
         self,
         problem: Problem,
-        contenders: Mapping[int, tuple[Start, list[Step]]],
+        contenders: Mapping[int, Start],
         steps: int,
         step_name: str,
         *,
         replace_best: bool,
     ) -> None:
-        """Run local searches, `SEARCHES_PER_DEVICE` at a time for each device.
-
-        `contenders` has the starting point of each local search, and the history before it.
-        """
+        """Run local searches, `SEARCHES_PER_DEVICE` at a time for each device; contenders: their starting points."""
         tightened, bests, reports = self.tightened(problem), dict[int, Best](), 0
 
         def search(k: int, ask: Ask) -> None:
-            start, before = contenders[k]
+            start = contenders[k]
             bests[k] = self._new_best(problem, start.normalised)
-            self._history[k] = list(before)  # the longer search records the points of the shorter one again
             search_locally(ask, bests[k], start, steps, partial(self._record, k), relaxed=_relaxed(problem))
 
         def report_new_searches() -> None:
@@ -507,10 +505,12 @@ class LocalSearches:
             self._best, self._problem, self._best_start = best, tightened, start
 
     def _record(self, start: int, measured: Measurement) -> None:
-        """Append a measured point to the history of the local search with this number."""
+        """Append a measured point to the history of the local search with this number, unless it is there already."""
         worst = np.where(count_failures(measured.c)[0] > 0, np.inf, largest_ratios(measured.c, self._margin)[0])
         step = Step(start, measured.gains[0], float(measured.objective[0]), worst)
-        self._history.setdefault(start, []).append(step)
+        steps = self._history.setdefault(start, [])
+        if not any(_is_equal(step, earlier) for earlier in steps):
+            steps.append(step)
 
     def tightened(self, problem: Problem) -> Problem:
         """Return the problem with tightened limits."""
