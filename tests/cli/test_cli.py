@@ -87,7 +87,7 @@ def test_tune_command_writes_results_and_repeats_them(command, tmp_path, monkeyp
     assert (tuned.loop.clock, tuned.controller.sign_width) == ("flight", 1e-3)
     header, *rows = (tmp_path / "t" / "history.csv").read_text().splitlines()
     assert header == "step,start,rms_window_error,eta,delta,peak_torque_over_limit"
-    assert len(rows) == summary["search"]["steps"] >= 2
+    assert len(rows) == summary["search"]["history_points"] >= 2
     # The tuned gains are more accurate than the scenario's gains on the same trials. They need not be more accurate
     # than the published gains, whose faster surface and observer are not free in this search.
     assert summary["held_out"]["window_error"]["rms"] < summary["before"]["window_error"]["rms"]

@@ -102,7 +102,7 @@ def summary(tuning: Tuning) -> dict[str, object]:
             "minimise": tuning.tuned.search.minimise,
             "objective_value": search.value,
             "starts": len({step.start for step in search.history}),
-            "steps": len(search.history),
+            "history_points": len(search.history),
             "rounds_with_harder_trials": search.rounds,
             "margins": search.margins,
             "earlier": [asdict(earlier) for earlier in tuning.earlier],
