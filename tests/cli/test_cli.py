@@ -68,6 +68,8 @@ def test_tune_command_writes_results_and_repeats_them(command, tmp_path, monkeyp
     assert status == (0 if summary["status"] == "met" else 1)
     assert {"gains", "training", "held_out", "published", "verdicts"} <= set(summary)
     assert summary["held_out"]["trials"] == 40
+    listed = {name for group in ("held_out", "published", "before") for name in summary[group]["gains"]}
+    assert summary["gain_units"].keys() == {name for name in listed if "observer_gain_" not in name}
     assert summary["held_out"]["seed"] != summary["training"]["seed"]
     published = {"eta": 3.0, "delta": 0.1}  # the published delta of 0.05 s is below one period
     known = {"held_out": summary["gains"], "published": published}

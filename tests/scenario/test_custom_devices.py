@@ -294,7 +294,7 @@ def test_gains_of_custom_sensors_are_tuned_and_written():
     assert loaded.tune.bounds["sensors_share"] == (0.05, 1.0)
     parts = scenario.study(loaded).parts
     assert gains.gains_of(parts)["sensors_share"] == 0.5
-    assert gains.units_of(loaded)["sensors_share"] == "-"
+    assert gains.units_of(loaded, ["sensors_share"]) == {"sensors_share": "-"}
     other = gains.in_scenario(loaded, {"sensors_share": 0.3})
     assert other.sensors.share == 0.3
     assert gains.controls_differ(loaded, other)

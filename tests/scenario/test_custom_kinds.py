@@ -108,7 +108,7 @@ def test_reading_runs_no_code_and_completing_finds_keys_gains_and_bounds():
     assert whole.tune is not None
     assert whole.tune.free == ("delta", "eta", "k1")
     assert dict(whole.tune.bounds) == {"eta": (2.1, 6.0), "delta": (0.1, 2.0), "k1": (0.2, 5.0)}
-    assert gains.units_of(whole)["k1"] == "1/s"
+    assert gains.units_of(whole, ["k1", "eta"]) == {"k1": "1/s", "eta": "-"}
     again = scenario.replace(whole, controller__eta=4.0)  # stays complete
     assert again.controller.eta == 4.0
     assert reading.complete(scenario.from_tables(parsing.dump(whole))) == whole
@@ -155,7 +155,7 @@ def test_custom_gains_can_be_set_in_parts_and_in_the_scenario():
     assert gains.present_values(moved, gains.free_gain_names(whole)) == [0.5, 1.0, 0.25, 1e-3, 3.5]
     written = gains.in_scenario(whole, {"m": 2.0, "observer_rate": 4.0})
     assert (written.controller.m, written.observer.rate) == (2.0, 4.0)
-    assert gains.units_of(whole)["observer_rate"] == "1/s"
+    assert gains.units_of(whole, ["observer_rate"]) == {"observer_rate": "1/s"}
 
 
 SIGNED = """

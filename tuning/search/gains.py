@@ -32,9 +32,13 @@ def units(plant: str) -> dict[str, str]:
     )
 
 
-def units_of(scenario: Scenario) -> dict[str, str]:
-    """Return the unit of each gain of a scenario, by name, including the gains of custom laws and observers."""
-    return units(scenario.plant.kind) | _collect_units(type(table) for table in scenario.tuned_tables.values())
+def units_of(scenario: Scenario, names: Iterable[str]) -> dict[str, str]:
+    """Return the unit of each of these gains by name, without the number of an axis.
+
+    The gains belong to a scenario, which may have custom laws and observers, or to another law for its plant.
+    """
+    known = units(scenario.plant.kind) | _collect_units(type(table) for table in scenario.tuned_tables.values())
+    return {name: known[name] for name in map(base, names) if name in known}
 
 
 def _collect_units(tables: Iterable[Any]) -> dict[str, str]:

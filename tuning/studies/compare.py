@@ -292,7 +292,7 @@ def contender_results(contender: Contender) -> dict[str, object]:
             for name in ("peak_torque", "effort", "chattering")}  # fmt: skip
     return {
         "gains": contender.gains,
-        "gain_units": gains.units_of(contender.simulated),
+        "gain_units": gains.units_of(contender.simulated, contender.gains),
         "at_bound": contender.at_bound,
         "met": contender.met,
         "counts": trials.counts(),

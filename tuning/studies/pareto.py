@@ -66,10 +66,13 @@ def trace(trade: Trade, seed: int, report: Report = lambda *_: None, journal: Jo
         point = Point(np.nan, gains.gains_of(study(compared).parts))
         return _judge_point(trade, point, compared, held_out_seed, reach)[0]
 
+    points = mark_points(judged) if trade.compares_points else [point for point, _ in judged]
+    others = {name: judge_reference(compared) for name, compared in references.items()}
+    gain_names = [name for point in (*points, *others.values()) for name in point.gains]
     return Front(
         against=trade.against,
         plant=scenario.plant.kind,
-        points=mark_points(judged) if trade.compares_points else [point for point, _ in judged],
+        points=points,
         idle=[targets[k].value for k in best if k not in chosen],
         without=[target.value for k, target in enumerate(targets) if k not in best],
         trials=judged[0][1].status.size if judged else 0,
@@ -79,11 +82,11 @@ def trace(trade: Trade, seed: int, report: Report = lambda *_: None, journal: Jo
         rollouts=setup.evaluate.rollouts,
         gradients=setup.evaluate.gradients,
         requirements=list(scenario.requirements),
-        gain_units=gains.units_of(scenario),
+        gain_units=gains.units_of(scenario, gain_names),
         warnings=plausibility.warnings(scenario),
         published_label=gains.published_label(scenario),
         published_unavailable=published_error,
-        others={name: judge_reference(compared) for name, compared in references.items()},
+        others=others,
     )
 
 

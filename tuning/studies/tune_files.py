@@ -82,7 +82,7 @@ def summary(tuning: Tuning) -> dict[str, object]:
     return {
         "status": tuning.status,
         "plant": kind,
-        "gain_units": gain_names.units_of(tuning.tuned),
+        "gain_units": gain_names.units_of(tuning.tuned, itertools.chain(*tuning.judged_gains.values())),
         "gains": tuning.gains,
         "at_bound": tuning.at_bound,
         **_accuracy_gain(tuning.held_out),
@@ -248,7 +248,7 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, "Figure"]:
     from ptsmc_jax.figures import study_plots, style  # slow import, not needed before the search ends
 
     kind, names = scenario.plant.kind, gain_names.free_gain_names(scenario)
-    unit_of = gain_names.units_of(scenario)
+    unit_of = gain_names.units_of(scenario, names)
     units = [unit_of[gain_names.base(name)] for name in names]
     paths = _points_by_start(tuning.search.history)
     longest = max(map(len, paths))
