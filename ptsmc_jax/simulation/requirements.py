@@ -138,7 +138,7 @@ class Verdict:
         result = f"{percent(fraction)} %"
         if self.confidence is not None and self.shown is not None:
             result += f", at least {percent(self.shown)} % at {100 * self.confidence:g} % confidence"
-        return f"{requirement}: {result}: {self.word}"
+        return f"{requirement}: {result}: {self.word}{self._describe_missing_trials('runs', 0)}"
 
     def _describe_trials(self) -> str:
         failures, trials, worst = self.failures, self.trials, self.worst
@@ -158,12 +158,21 @@ class Verdict:
         least = must_keep(trials, self.quantile, self.confidence)
         if self.met:
             reason = f", beyond it {failures} of {trials} {noun}" if failures else ""
-        elif self.word == "NOT shown" and self.quantile is not None and self.confidence is not None:
-            reason = f", which takes at least {fewest_trials(self.quantile, self.confidence)} trials"
+        elif self.word == "NOT shown":
+            reason = self._describe_missing_trials(noun, failures)
         else:
             allowed = f", at most {trials - least} allowed" if least is not None and trials > least else ""
             reason = f" in {failures} of {trials} {noun}{allowed}" if trials > 1 else ""
         return f"{requirement}: {result}: {self.word}{reason}"
+
+    def _describe_missing_trials(self, noun: str, failures: int) -> str:
+        """Return how many trials the verdict "met" takes; empty unless the verdict is "NOT shown"."""
+        if self.word != "NOT shown" or self.quantile is None or self.confidence is None:
+            return ""
+        from ptsmc_jax.numerics import statistics  # imports SciPy, which takes a while
+
+        needed = statistics.fewest_trials(failures, self.quantile, self.confidence)
+        return f", which takes at least {needed} {noun} with {'as many failures' if failures else 'no failure'}"
 
 
 def quantity(value: float, unit: str, digits: int, metric: str = "") -> str:

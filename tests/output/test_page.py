@@ -17,7 +17,7 @@ from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import SHORT_CHAIN, refused, short, tree
 from tests.output import examples
 from tests.output.pages import checked
-from tuning.output import page, page_charts, report
+from tuning.output import campaign_report, page, page_charts, report
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 HOSTILE = "<img src=x onerror=document.title=1>\"'&</script><script>alert(1)</script>"
@@ -125,6 +125,18 @@ def test_the_verdict_comes_first(simulated, status, mood, said):
 def test_what_failed_looks_bad_whether_or_not_anything_was_asked(status, asked, mood):
     verdicts = [examples.entry(Requirement("peak_torque", 0.5).verdict(np.zeros(2), np.ones(2, bool)))]
     assert report.headline(status, verdicts if asked else [])[1] == mood
+
+
+def test_the_headline_tells_requirements_that_are_not_met_from_those_that_are_not_shown():
+    limit = Requirement("peak_torque", 0.5, quantile=0.99, confidence=0.9)
+    shown, not_shown, not_met = (examples.entry(limit.verdict(np.full(count, value), np.ones(count, bool)))
+                                 for count, value in ((230, 0.4), (229, 0.4), (230, 0.6)))  # fmt: skip
+    assert report.headline("met", [shown])[0] == "Every requirement is met"
+    assert report.headline("not met", [shown, not_shown])[0] == "NOT shown that every requirement is met"
+    assert report.headline("not met", [not_shown, not_met])[0] == "NOT every requirement is met"
+    fractions = {"fraction": 1.0, "fraction_interval": (0.98, 1.0), "fraction_bound": 0.98, "fewest_trials": 230}
+    in_campaign = examples.entry(limit.verdict(np.zeros(229), np.ones(229, bool)), **fractions)
+    assert campaign_report.verdict_with_fraction(in_campaign).count("230") == 1
 
 
 def hostile_folder(simulated):

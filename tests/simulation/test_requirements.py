@@ -139,7 +139,7 @@ def test_a_single_run_is_judged_by_the_limit_alone():
 def test_a_campaign_of_one_trial_demonstrates_no_fraction():
     told = Requirement("peak_torque", LIMIT, None, 0.99, 0.9).verdict(np.array([0.4]), np.array([True]))
     assert not told.met
-    assert str(told).endswith("0.4 N m: NOT shown, which takes at least 230 trials")
+    assert str(told).endswith("0.4 N m: NOT shown, which takes at least 230 trials with no failure")
     assert told.word == "NOT shown"
 
 
@@ -165,8 +165,10 @@ def test_a_fraction_is_printed_in_words():
     values[:9] = 0.6
     assert str(share.verdict(values, ok)) == f"{said} 0.6 N m: NOT met in 9 of 1000 trials, at most 5 allowed"
     assert str(share.verdict(values[:50], ok[:50])) == f"{said} 0.6 N m: NOT met in 9 of 50 trials"
+    some = str(share.verdict(values[8:150], ok[8:150]))
+    assert some.endswith("N m: NOT shown, which takes at least 388 trials with as many failures")
     few = str(share.verdict(values[9:50], ok[9:50]))
-    assert few.endswith("N m: NOT shown, which takes at least 230 trials")
+    assert few.endswith("N m: NOT shown, which takes at least 230 trials with no failure")
 
 
 RUNS = 1000
@@ -202,7 +204,9 @@ def test_mixed_requires_a_fraction_of_the_time_of_all_runs():
     never = of_time("mixed", np.ones(852), confidence=0.9)
     assert never.met  # as many runs without a violation as for an ensemble
     assert never.shown == pytest.approx(0.1 ** (1 / 852))
-    assert of_time("mixed", np.ones(851), confidence=0.9).word == "NOT shown"
+    told = of_time("mixed", np.ones(851), confidence=0.9)
+    assert told.word == "NOT shown"
+    assert str(told).endswith("NOT shown, which takes at least 852 runs with no failure")
     # half of the runs exceed the limit for 1/200 of the time, which would violate an ensemble requirement
     kept = np.where(np.arange(RUNS) % 2, 1.0, 0.995)
     told = of_time("mixed", kept)

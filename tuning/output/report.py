@@ -118,6 +118,8 @@ def headline(status: str, verdicts: "Sequence[Entry]", error_text: str = "") -> 
     text = HEADLINES.get(status, f"the run failed: {status.replace('_', ' ')}")
     if not verdicts and status in ("met", "not met"):
         text = "every trial reached its end" if status == "met" else "NOT every trial reached its end"
+    elif status == "not met" and {verdict.word for verdict in verdicts} - {"met"} == {"NOT shown"}:
+        text = "NOT shown that every requirement is met"
     mood = {"met": "good", "ok": "calm"}.get(status, "bad")
     mood = "calm" if mood == "good" and not verdicts else mood
     return f"{error_text}: {text}" if error_text else text[0].upper() + text[1:], mood
