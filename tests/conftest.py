@@ -92,6 +92,7 @@ def command(request, tmp_path, monkeypatch, capsys):
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("ptsmc_jax.configure.configure", lambda **_: None)  # done above
+    monkeypatch.setattr("tuning.output.progress.INTERVAL", 3600.0)  # no progress lines, also on a slow machine
     (tmp_path / "s.toml").write_text(getattr(request.module, "SCENARIO", SHORT))
 
     def run(*args):

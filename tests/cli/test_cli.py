@@ -470,10 +470,10 @@ def test_long_run_prints_its_number_of_integration_steps(command, monkeypatch):
     parts = scenario.study(scenario.read("s.toml")).parts
     steps = timing.count_steps(parts)
     assert steps == parts.clock.ticks(parts.controller.t_f, parts.controller.delta).t.size * parts.substeps
-    assert "integration steps" not in command(*run)[1]
-    monkeypatch.setattr("tuning.cli.main.LONG", steps - 1)
-    assert command(*run)[1].startswith(f"simulating {steps} integration steps with their history\n")
-    assert command(*run, "--quiet")[1] == ""
+    assert "integration steps" not in command(*run)[2]
+    monkeypatch.setattr("tuning.output.progress.INTERVAL", 0.001)
+    assert f"ptsmc: simulating {steps} integration steps with their history, 0 s so far\n" in command(*run)[2]
+    assert command(*run, "--quiet")[1:] == ("", "")
 
 
 def test_unknown_matplotlib_backend_does_not_stop_a_command():

@@ -20,7 +20,7 @@ def test_a_line_comes_also_while_nothing_new_is_said(capsys, monkeypatch):
         tell("pd: compiling", 0, 0)
         time.sleep(0.4)
     said = capsys.readouterr().err.splitlines()
-    assert 3 <= said.count("ptsmc: pd: compiling, 0 s") <= 8
+    assert 3 <= said.count("ptsmc: pd: compiling, 0 s so far") <= 8
     time.sleep(0.2)
     assert not capsys.readouterr().err
     with progress.Progress(quiet=True):
@@ -33,23 +33,45 @@ def test_a_line_has_the_number_of_steps(capsys, monkeypatch):
     with progress.Progress(quiet=False) as tell:
         tell("searching", 1, 7)
         time.sleep(0.2)
-    assert set(capsys.readouterr().err.splitlines()) == {"ptsmc: searching, 1 of 7, 0 s"}
+    assert set(capsys.readouterr().err.splitlines()) == {"ptsmc: searching, 1 of 7, 0 s so far"}
 
 
-def test_trials_a_second_are_those_flown_since_the_command_began(monkeypatch):
-    """3 000 in four seconds, of a campaign that goes on from 1 000; at first nothing is known. A slow rate is not 0."""
-    at, said = iter([10.0, 14.0, 14.0, 16010.0]), []
-    monkeypatch.setattr(progress.time, "monotonic", lambda: 0.0)
-    bar = progress.CampaignProgress(quiet=True)
-    monkeypatch.setattr(progress.time, "monotonic", lambda: next(at))
-    for done, failed in ((1000, 0), (4000, 2), (9000, 2), (9000, 2)):
-        bar(campaign.Tally(done, 9000, failed))
-        said.append(bar.__rich__())
-    assert said == [
-        "1000 of 9000 trials, compiling",
-        "4000 of 9000 trials, 750 a second, 2 failed or not converged",
-        "9000 of 9000 trials, 2,000 a second, 2 failed or not converged",
-        "9000 of 9000 trials, 0.5 a second, 2 failed or not converged",
+def reported(bar, monkeypatch, *reports):
+    """Return the texts of a bar after reports, each a time [s] and the arguments of the report, if there is one."""
+    texts = []
+    for now, *arguments in reports:
+        monkeypatch.setattr(progress.time, "monotonic", lambda now=now: now)
+        if arguments:
+            bar(*arguments)
+        texts.append(bar.__rich__())
+    return texts
+
+
+def test_the_rate_of_a_campaign_is_measured_after_its_first_part(monkeypatch):
+    """The program is compiled before the first part is simulated. Several parts may end at the same time."""
+    tallies = [(10.0, 1000, 0), (60.0, 2000, 2), (60.0, 3000, 2), (64.0, 5000, 2), (30064.0, 9000, 2)]
+    texts = reported(progress.CampaignProgress(quiet=True), monkeypatch,
+                     *((now, campaign.Tally(done, 9000, failed)) for now, done, failed in tallies))  # fmt: skip
+    assert texts == [
+        "1000 of 9000 trials",
+        "2000 of 9000 trials, 2 failed or not converged",
+        "3000 of 9000 trials, 2 failed or not converged",
+        "5000 of 9000 trials, 750 a second, 2 failed or not converged, about 5 s left",
+        "9000 of 9000 trials, 0.2 a second, 2 failed or not converged",
+    ]
+
+
+def test_the_time_left_of_a_step_follows_from_the_work_done_so_far(monkeypatch):
+    steps = [(5.0, "searching", 0, 8), (35.0, "searching", 1, 8), (65.0, "searching", 2, 8), (155.0,), (300.0,),
+             (301.0, "refining", 0, 2), (311.0, "refining", 2, 2)]  # fmt: skip
+    assert reported(progress.Progress(quiet=True), monkeypatch, *steps) == [
+        "searching, 0 of 8",
+        "searching, 1 of 8",  # the first piece of work may include a compilation
+        "searching, 2 of 8, about 3 min left in this step",
+        "searching, 2 of 8, about 90 s left in this step",
+        "searching, 2 of 8",
+        "refining, 0 of 2",
+        "refining, 2 of 2",
     ]
 
 
@@ -106,4 +128,4 @@ def test_a_compilation_that_a_step_waits_for_is_named(capsys, monkeypatch):
     with progress.Progress(quiet=False) as tell:
         tell("searching", 1, 7)
         time.sleep(0.2)
-    assert set(capsys.readouterr().err.splitlines()) == {"ptsmc: compiling the gradients, 2 of 3, 0 s"}
+    assert set(capsys.readouterr().err.splitlines()) == {"ptsmc: compiling the gradients, 2 of 3, 0 s so far"}

@@ -215,7 +215,7 @@ def test_search_widens_default_bounds_of_gains_that_matter(monkeypatch):
     factors = [one["k1"][1] / usual["k1"][1] for one in searched]
     np.testing.assert_allclose(factors, 10.0 ** np.arange(1 + tuner.MOST_WIDENINGS), rtol=1e-12)
     assert all(one["eta"] == usual["eta"] for one in searched)
-    assert told == ["searching beyond the bounds of k1"] * tuner.MOST_WIDENINGS
+    assert told == [f"beyond the bounds of k1, search {k} of at most 3" for k in (1, 2, 3)]
     assert found.gains[1] == pytest.approx(1e3 * usual["k1"][1])
     assert len(found.history) == 1 + tuner.MOST_WIDENINGS
     assert posed.evaluate.rollouts == 10 * (1 + tuner.MOST_WIDENINGS)

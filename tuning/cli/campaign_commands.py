@@ -274,10 +274,12 @@ def replay(
     if trial >= campaign.trials:
         raise UsageError(f"--trial is {trial}, but must be a whole number from 0 to {campaign.trials - 1}")
     replay_folder = out if out is not None else folder / "replay" / str(trial)
-    store.check_folder(replay_folder, common.force or out is None)  # a replay overwrites an earlier one
+    is_overwritten = common.force or out is None  # a replay overwrites an earlier one
+    store.check_folder(replay_folder, is_overwritten)
     custom_parts.allow_results(campaign.custom_code, folder, campaign.identity, common.trust)
     campaign = replace(campaign, trusted=True)
-    with store.lock_folder(replay_folder, force=common.force or out is None):
+    with store.lock_folder(replay_folder, force=is_overwritten), Progress(common.quiet) as report:
+        report(f"simulating trial {trial}", 0, 0)
         repeated = campaign_summary.replay(campaign, trial)
         run_details = campaign.scenario, repeated.run, campaign.seed, trial, common.figures, campaign.computer
         # `ptsmc simulate` can repeat neither a row of a run table nor a run with 32 bits

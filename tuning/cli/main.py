@@ -39,8 +39,6 @@ app = App(
     suppress_keyboard_interrupt=False,
 )
 
-LONG = 20_000  # number of integration steps above which a run takes several seconds
-
 
 @app.command
 def simulate(
@@ -80,10 +78,8 @@ def simulate(
         computer = InTheLoop(Library(controller), ready.parts, ready.dispersion)
         if computer.parameter_differences:
             print(f"ptsmc: {computer.parameter_differences}", file=sys.stderr)
-    steps = timing.count_steps(ready.parts)
-    if steps > LONG and not common.quiet:
-        terminal.print_lines(f"simulating {steps} integration steps with their history")
-    with store.lock_folder(folder, force=common.force):
+    with store.lock_folder(folder, force=common.force), progress.Progress(common.quiet) as report:
+        report(f"simulating {timing.count_steps(ready.parts)} integration steps with their history", 0, 0)
         run = runs.simulate(ready, seed, trial, PYTHON_SOFTWARE if computer is None else computer.software)
         written = loaded, run, seed, trial, common.figures, computer
         store.write_folder(folder, lambda staging: single.write(staging, *written, aem=aem))

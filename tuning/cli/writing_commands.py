@@ -12,6 +12,7 @@ from cyclopts import Parameter
 from tuning.cli.options import Force, Out, Quiet, Seed, Trust, prepare, whole_number
 from tuning.errors import UsageError
 from tuning.output import terminal
+from tuning.output.progress import Progress
 
 Overwrite = Annotated[bool, Parameter(help="Overwrite existing files.")]
 
@@ -161,7 +162,8 @@ def export(
     c_name = controllers.identifier(name or scenario.stem)
     controller = controllers.Controller(loaded, c_name, scenario.name, reference_input)
     fmus = controllers.Fmus(fmu, fmu_plant, fmi, not no_binary)
-    with store.lock_folder(folder, force=force):
+    with store.lock_folder(folder, force=force), Progress(quiet) as report_progress:
+        report_progress("writing the controller and its test vectors", 0, 0)
         store.write_folder(folder, lambda staging: controllers.write(staging, controller, seed, trials, fmus))
     if not quiet:
         costs = templates.format_counts(controller.code.counts)

@@ -1,6 +1,7 @@
 """Progress on the error stream: a bar on a terminal, else a line every ten seconds."""
 
 import contextlib
+import math
 import sys
 import threading
 import time
@@ -12,33 +13,35 @@ if TYPE_CHECKING:
     from ptsmc_jax.campaigns.campaign import Tally
 
 INTERVAL = 10.0  # time between two printed lines [s]
+SHORTEST = 1.0  # shortest time that a rate is measured in [s]
 
 
 class Bar:
-    """A progress bar with the time left within `with`. If the error stream is no terminal, it prints lines instead.
+    """A progress bar within `with`. If the error stream is no terminal, it prints lines instead.
 
     A thread prints the latest step every ten seconds, also during long compilations.
 
     Args:
         quiet: print nothing.
-        counted: show the numbers of steps too.
     """
 
-    def __init__(self, quiet: bool, *, counted: bool = False):
+    left = "left"  # ending of the text about the time left
+
+    def __init__(self, quiet: bool):
         from rich import progress
         from rich.console import Console
 
         console = Console(stderr=True)
         self._prints_lines = not quiet and not console.is_terminal
         self._start_time, self._ended = time.monotonic(), threading.Event()
-        self._step, self._count = "compiling", ""  # the step in words; numbers of steps, only for lines
+        self._step = "compiling"  # the step in words
+        # work in all, and time and work done of the report that the rate is measured from
+        self._total, self._first_time, self._first_done = 0, self._start_time, 0
+        self._end_time = -math.inf  # estimated time of the monotonic clock at the end of the work
         self._bar = progress.Progress(
             progress.RenderableColumn(self),
             progress.BarColumn(20),
-            *([progress.MofNCompleteColumn()] if counted else []),
             progress.TimeElapsedColumn(),
-            progress.TextColumn("left"),
-            progress.TimeRemainingColumn(),
             console=console,
             disable=quiet or not console.is_terminal,
         )
@@ -55,14 +58,32 @@ class Bar:
         self._ended.set()
 
     def __rich__(self) -> str:
-        """Return the current step, or the program that it waits for, for a column of `rich`."""
-        return _compilation_progress() or self._step
+        """Return the current step with the time left, or the program that it waits for, for a column of `rich`."""
+        seconds = self._end_time - time.monotonic()
+        left = f", about {f'{seconds:.0f} s' if seconds < 120.0 else f'{seconds / 60.0:.0f} min'} {self.left}"
+        return _compilation_progress() or self._step + (left if seconds >= 1.0 else "")
+
+    def _measure_rate(self, done: int, total: int, *, again: bool = False) -> float:
+        """Return the work done in a second, 0 before it is known, and estimate the end of the work.
+
+        Args:
+            done: work done so far.
+            total: work in all. The measurement begins again if it changes.
+            again: begin the measurement again.
+        """
+        now = time.monotonic()
+        if again or total != self._total:
+            self._total, self._first_time, self._first_done = total, now, done
+        seconds, measured = now - self._first_time, done - self._first_done
+        rate = measured / seconds if seconds >= SHORTEST and measured > 1 else 0.0
+        self._end_time = now + (total - done) / rate if rate else -math.inf
+        return rate
 
     def _print_periodically(self) -> None:
         while not self._ended.wait(INTERVAL):
-            text = _compilation_progress() or f"{self._step}{self._count}"
+            text = self.__rich__()
             with contextlib.suppress(OSError):  # a closed pipe or a full disk is no reason to stop
-                print(f"ptsmc: {text}, {time.monotonic() - self._start_time:.0f} s", file=sys.stderr, flush=True)
+                print(f"ptsmc: {text}, {time.monotonic() - self._start_time:.0f} s so far", file=sys.stderr, flush=True)
 
 
 def _compilation_progress() -> str:
@@ -74,6 +95,8 @@ def _compilation_progress() -> str:
 class Progress(Bar):
     """The progress of a search or a study with the best objective so far."""
 
+    left = "left in this step"
+
     def __init__(self, quiet: bool, objective: str = "", plant: str = "spacecraft"):
         """Begin before the first step.
 
@@ -82,7 +105,7 @@ class Progress(Bar):
             objective: name of the objective.
             plant: kind of the plant, which decides the unit of a window error.
         """
-        super().__init__(quiet, counted=True)
+        super().__init__(quiet)
         self._objective, self._plant = objective, plant
 
     def __call__(self, step: str, done: int, total: int, value: float = float("nan"), violation: float = 0.0) -> None:
@@ -92,7 +115,8 @@ class Progress(Bar):
         limits = "limits met in training" if violation == 0.0 else f"{format_ratio(100.0 * violation)} % beyond a limit"
         best = f": {format_objective(self._objective, value, self._plant)}, {limits}" if value == value else ""
         self._bar.update(self._task, completed=done)
-        self._step, self._count = step + best, f", {done} of {total}" if total else ""
+        self._measure_rate(done, total)
+        self._step = f"{step}{best}{f', {done} of {total}' if total else ''}"
 
 
 class CampaignProgress(Bar):
@@ -100,20 +124,16 @@ class CampaignProgress(Bar):
 
     def __init__(self, quiet: bool):
         super().__init__(quiet)
-        self._started: tuple[float, int] | None = None
+        self._reports = 0
 
     def __call__(self, tally: "Tally") -> None:
         """Report the numbers of simulated and of failed trials so far."""
-        now = time.monotonic()
-        if self._started is None:
-            self._started = now, tally.done
-        start, done_at_start = self._started
-        rate = (tally.done - done_at_start) / (now - start) if tally.done > done_at_start else 0.0
+        self._reports += 1
+        # the first part took longer, because its program was compiled
+        rate = self._measure_rate(tally.done, tally.total, again=self._reports == 2)
         text = f"{tally.done} of {tally.total} trials"
         if rate:
             text += f", {rate:,.0f} a second" if rate >= 1.0 else f", {rate:.1g} a second"
-        elif tally.done < tally.total:
-            text += ", compiling"
         text += f", {tally.failed} failed or not converged" if tally.failed else ""
         self._bar.update(self._task, completed=tally.done, total=tally.total)
         self._step = text

@@ -17,7 +17,7 @@ from tuning.search.evolution import NEAR_BEST
 from tuning.search.local_searches import LocalSearches, Step
 from tuning.search.objective import Problem
 from tuning.search.progress import Report
-from tuning.search.rounds import Rounds
+from tuning.search.rounds import ROUNDS, Rounds
 from tuning.search.worst import Hardest
 
 Announce = Callable[[str], None]  # reports the name of the current step
@@ -171,5 +171,5 @@ def _repeat_with_harder_trials(
 ) -> None:
     """Repeat the search as long as harder trials join, unless the limits are out of reach."""
     while np.all(local_searches.best.worst <= HOPELESS) and rounds.add_harder_trials(local_searches.gains, announce):
-        announce(f"harder trials, round {rounds.count}")
+        announce(f"harder trials, round {rounds.count} of at most {ROUNDS}")
         continue_search(rounds.problem)

@@ -236,7 +236,7 @@ def _search_in_wider_bounds(
     without improvement ends the repetition.
     """
     default_bounds = setup.ready.scenario.defaulted
-    for _ in range(MOST_WIDENINGS):
+    for k in range(MOST_WIDENINGS):
         if outcome.interrupted or not setup.settings.with_gradients:
             break
         sides = _relevant_bounds(setup, outcome, setup.evaluate.bounds.at_bound(outcome.gains))
@@ -246,10 +246,11 @@ def _search_in_wider_bounds(
         )
         if not new_bounds:
             break
-        report(f"searching beyond the bounds of {', '.join(new_bounds)}", 0, 0, outcome.value, outcome.violation)
+        heading = f"beyond the bounds of {', '.join(new_bounds)}, search {k + 1} of at most {MOST_WIDENINGS}"
+        report(heading, 0, 0, outcome.value, outcome.violation)
         wider = posing.set_up_tuning(posing.with_bounds(scenario, new_bounds), setup.settings.seed, journal)
         wider.evaluate.continue_counts(setup.evaluate)
-        repeated = wider.search(wider.problem, outcome.gains, 1, report=report)
+        repeated = wider.search(wider.problem, outcome.gains, 1, report=headed(report, heading))
         history = [*outcome.history, *_renumber_starts(outcome.history, repeated.history)]
         is_better = (repeated.violation, repeated.value) < (outcome.violation, outcome.value * (1.0 - trust.FLAT))
         if not is_better:
