@@ -199,6 +199,16 @@ NO_REQUIREMENTS = SHORT_CHAIN.replace("[requirements]\npeak_torque = 3.0\n", "")
 HALF = SHORT_CHAIN.replace("peak_torque = 3.0", "peak_torque = 0.38")  # about half of the trials keep this limit
 
 
+def test_a_campaign_reports_first_which_requirements_its_trials_cannot_verify(command, tmp_path, monkeypatch):
+    limit = "peak_torque = { limit = 3.0, quantile = 0.99, confidence = 0.9 }\neffort = 9.0"
+    (tmp_path / "s.toml").write_text(SHORT_CHAIN.replace("peak_torque = 3.0", limit))
+    monkeypatch.setattr("tuning.studies.campaign_folder.begin", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    few, enough = (command("montecarlo", "s.toml", "--trials", count)[2] for count in (229, 230))
+    assert few.startswith("ptsmc: peak_torque in 99 % of trials with 90 % confidence takes at least 230 trials")
+    assert "takes" not in enough
+    assert "effort" not in few
+
+
 def test_until_confident_needs_requirements(command, tmp_path):
     (tmp_path / "s.toml").write_text(NO_REQUIREMENTS)
     assert "needs [requirements]" in refused(command, tmp_path, "montecarlo", "s.toml", "--until-confident", "0.1")

@@ -31,6 +31,7 @@ from tuning.output.progress import CampaignProgress, Progress
 
 if TYPE_CHECKING:
     from ptsmc_jax.campaigns.cluster import Cluster
+    from ptsmc_jax.scenario.tables import Scenario
     from tuning.studies.campaign_folder import Folder
 
 CAMPAIGN_SEED = 1000  # differs from the default seed of a search, whose trials must not verify its gains
@@ -145,6 +146,7 @@ def montecarlo(
     _ = folder.campaign  # raises configuration errors before anything is written
     if folder.parameter_differences:
         print(f"ptsmc: {folder.parameter_differences}", file=sys.stderr)
+    _warn_about_trials(loaded, folder.trials)
 
     with (
         resumable(common.force),
@@ -174,6 +176,21 @@ def montecarlo(
             "when all are there, in this folder or gathered into one: ptsmc summarize DIR",
         )
     return 0
+
+
+def _warn_about_trials(loaded: "Scenario", trials: int) -> None:
+    """Print a warning for each requirement that cannot be verified by so few trials."""
+    from ptsmc_jax import scenario as scenarios
+    from ptsmc_jax.simulation.requirements import fewest_trials
+
+    for requirement in scenarios.requirements(loaded):
+        quantile, confidence = requirement.quantile, requirement.confidence
+        if quantile and confidence and trials < (needed := fewest_trials(quantile, confidence)):
+            print(
+                f"ptsmc: {requirement.metric} in {100 * quantile:g} % of trials with {100 * confidence:g} % confidence "
+                f"takes at least {needed} trials with no failure; with {trials} its verdict is NOT shown or NOT met",
+                file=sys.stderr,
+            )
 
 
 def _connect_cluster(cluster: str | None, tls: dict[str, str]) -> "contextlib.AbstractContextManager[Cluster | None]":
