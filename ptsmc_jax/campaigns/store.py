@@ -70,11 +70,10 @@ def packages() -> dict[str, str]:
 
 def read_versions(folder: Path) -> dict[str, Any]:
     """Return the content of a result's versions.json; empty if it cannot be read."""
-    return read_json(folder / "versions.json")
+    return _read_json(folder / "versions.json")
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """Return the content of a JSON file with an object; empty if it cannot be read."""
+def _read_json(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
@@ -84,7 +83,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 def read_previous_summary(folder: Path, scenario: Tables, made_by: Tables) -> dict[str, Any] | None:
     """Return the summary of the same scenario, command, seed and other inputs (`versions`); None if there is none."""
-    summary = {} if describe_difference(folder, scenario, made_by) else read_json(folder / SUMMARY)
+    summary = {} if describe_difference(folder, scenario, made_by) else _read_json(folder / SUMMARY)
     return summary if "status" in summary else None
 
 

@@ -124,14 +124,14 @@ class Verdict:
 
     def __str__(self) -> str:
         """The verdict in one line."""
-        fraction = self.fraction_of_time
-        return self._describe_trials() if fraction is None else self._describe_time(fraction)
+        if self.fraction_of_time is None or self.quantile is None:
+            return self._describe_trials()
+        return self._describe_time(self.fraction_of_time, self.quantile)
 
-    def _describe_time(self, fraction: float) -> str:
-        assert self.quantile is not None
+    def _describe_time(self, fraction: float, quantile: float) -> str:
         limit = quantity(self.limit, self.unit, 6, self.metric)
         population = INTERPRETATIONS[self.interpretation]
-        requirement = f"{self.metric} at most {limit} in {100 * self.quantile:g} % of {population}"
+        requirement = f"{self.metric} at most {limit} in {100 * quantile:g} % of {population}"
         if self.interpretation == "temporal":
             beyond = "" if self.met or self.trials == 1 else f", {self.failures} of {self.trials} runs have less"
             return f"{requirement}: the least of a run is {percent(fraction)} %: {self.word}{beyond}"

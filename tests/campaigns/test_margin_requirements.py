@@ -416,6 +416,8 @@ def test_assumed_error_of_delay_margins_is_a_fraction_of_a_period(monkeypatch, p
     [
         pytest.param(None, True, marks=pytest.mark.long),  # with real loops
         (None, False), ('{"lower_bound": 1e-6, "marg', False), ('{"lower_bound": 1e-6}', False),
+        ('{"lower_bound": 1e-6, "margins": [1]}', False), ('{"lower_bound": {}, "margins": []}', False),
+        ('{"lower_bound": 1e-6, "margins": [{"metric": "gain_margin"}]}', False),
     ],
 )  # fmt: skip
 def test_campaign_without_its_margin_verdicts_is_unfinished(command, tmp_path, monkeypatch, left, of_loops):

@@ -118,6 +118,11 @@ def test_tune_command_writes_results_and_repeats_them(command, tmp_path, monkeyp
     other, _, err = command("tune", "s.toml", "--out", "t", "--seed", 1)
     assert other == 2
     assert "--force" in err
+    for damaged in ({"status": "met"}, {**summary, "status": "?"}, {**summary, "held_out": 1}):
+        (tmp_path / "t" / "summary.json").write_text(json.dumps(damaged))
+        assert "t/summary.json is damaged or of another version" in refused(
+            command, tmp_path, "tune", "s.toml", "--out", "t"
+        )
 
 
 # here, because the search above compiled the same programs

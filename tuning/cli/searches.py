@@ -1,5 +1,6 @@
 """Start, resume or show again the long searches of `tune`, `pareto` and `compare`."""
 
+import contextlib
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -75,6 +76,11 @@ def run(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, qu
                 print(f"ptsmc: interrupted; {how_to_resume(force)}", file=sys.stderr)
         summary = store.read_previous_summary(folder, tables, search.identity)
     assert summary is not None
-    if not quiet:
-        terminal.print_result(search.identity["command"], summary, loaded.plant.kind, folder, earlier=was_finished)
-    return STATUS[summary["status"]]
+    from tuning.output import reports
+
+    # only an earlier summary may be damaged
+    with reports.name_in_errors(folder / store.SUMMARY) if was_finished else contextlib.nullcontext():
+        status = STATUS[summary["status"]]
+        if not quiet:
+            terminal.print_result(search.identity["command"], summary, loaded.plant.kind, folder, earlier=was_finished)
+    return status

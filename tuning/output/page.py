@@ -5,7 +5,6 @@ nothing from elsewhere; every text is escaped.
 """
 
 import base64
-import contextlib
 import csv
 import hashlib
 import json
@@ -116,23 +115,11 @@ def read(folder: Path) -> Result:
             raise RefusedError(
                 f"{path} does not exist: the results of `ptsmc {command}` are incomplete; run the same command {remedy}"
             )
-    with _name_in_errors(source):
+    with reports.name_in_errors(source):
         is_map = command == "map"
         summary = {"rows": _read_rows(source)} if is_map else msgspec.json.decode(source.read_bytes(), type=dict)
     scenario = {} if command == "reproduce" else parsing.read_toml(folder / "scenario.toml")
     return Result(folder, versions, source, summary, scenario)
-
-
-@contextlib.contextmanager
-def _name_in_errors(path: Path) -> Iterator[None]:
-    """Raise RefusedError with the name of a file instead of the errors that its content causes."""
-    try:
-        yield
-    except RefusedError:
-        raise
-    except (csv.Error, AttributeError, LookupError, TypeError, ValueError, RecursionError) as error:
-        problem = f"{error} is missing" if isinstance(error, KeyError) else error
-        raise RefusedError(f"{path} is damaged or of another version: {problem}; make it again") from None
 
 
 def _read_rows(path: Path) -> list[list[str]]:
@@ -167,7 +154,7 @@ def build(folder: Path) -> str:
         from plotly.offline import get_plotlyjs
     except ImportError as error:
         raise UsageError(f"the page needs {error.name}: pip install 'ptsmc-jax[report]'") from None
-    with _name_in_errors(result.source):
+    with reports.name_in_errors(result.source):
         report = reports.build(result.versions["command"], result.summary, result.plant)
     charts = _charts(result)
     sections = [
@@ -184,16 +171,17 @@ def build(folder: Path) -> str:
     allowed = " ".join(f"'sha256-{checksum}'" for checksum in checksums) or "'none'"
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string((HERE / "page.html").read_text(encoding="utf-8"))
-    return template.render(
-        title=f"ptsmc {result.versions['command']}: {folder.resolve().name}",
-        report=report,
-        sections=sections,
-        policy=f"default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; script-src {allowed}",
-        style=(HERE / "page.css").read_text(encoding="utf-8"),
-        # < is escaped, so that no text in the data can close the HTML element
-        figures=json.dumps(figures, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
-        scripts=scripts,
-    )
+    with reports.name_in_errors(result.source):
+        return template.render(
+            title=f"ptsmc {result.versions['command']}: {folder.resolve().name}",
+            report=report,
+            sections=sections,
+            policy=f"default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; script-src {allowed}",
+            style=(HERE / "page.css").read_text(encoding="utf-8"),
+            # < is escaped, so that no text in the data can close the HTML element
+            figures=json.dumps(figures, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
+            scripts=scripts,
+        )
 
 
 def _history_charts(result: Result) -> list[Block]:
@@ -201,7 +189,7 @@ def _history_charts(result: Result) -> list[Block]:
     head, *rows = _read_rows(result.folder / "trajectory.csv")
     values = np.array([[float(cell or "nan") for cell in row] for row in rows])
     columns = dict(zip(head, values.T, strict=True))
-    with _name_in_errors(result.folder / "scenario.toml"):
+    with reports.name_in_errors(result.folder / "scenario.toml"):
         law = result.scenario["controller"]
         marks = {"t_f": law["t_f"]}
     if law.get("delta", 0.0) >= 0.05 * columns["t"][-1]:  # otherwise the labels of t_f - delta and t_f overlap
@@ -239,7 +227,7 @@ def _charts(result: Result) -> dict[str, list[Block]]:
     """Return the charts and the table that only the page shows, by the titles of their sections."""
     command = result.versions["command"]
     files = {"simulate": TABLES["simulate"], "tune": TABLES["tune"], "montecarlo": "scenario.toml"}
-    with _name_in_errors(result.folder / files.get(command, store.SUMMARY)):
+    with reports.name_in_errors(result.folder / files.get(command, store.SUMMARY)):
         if command == "simulate":
             return {"History": _history_charts(result)}
         if command == "tune":

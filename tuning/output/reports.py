@@ -1,10 +1,14 @@
 """The report of each command. Start with `build`. The longer reports have modules of their own."""
 
+import contextlib
+import csv
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from ptsmc_jax.campaigns import store
+from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.catalogues import CATALOGUES, without_norms
 from tuning.output import campaign_report, compare_report, front_report, margins_report, report, summaries, tune_report
@@ -43,6 +47,20 @@ def build(command: str, summary: Mapping[str, object], plant: str) -> Report:
         KeyError, AttributeError, TypeError, msgspec.ValidationError: `summary` is not from this version of the command.
     """
     return REPORTS[command](summary, plant)
+
+
+@contextlib.contextmanager
+def name_in_errors(path: Path) -> Iterator[None]:
+    """Raise RefusedError with the name of a file instead of the errors that its content causes."""
+    try:
+        yield
+    except RefusedError:
+        raise
+    except (csv.Error, AttributeError, LookupError, TypeError, ValueError, RecursionError) as error:
+        problem = f"{error} is missing" if isinstance(error, KeyError) else error
+        raise RefusedError(
+            f"{path} is damaged or of another version: {problem}; repeat its command with --force"
+        ) from None
 
 
 def run_report(summary: summaries.Run, plant: str) -> Report:

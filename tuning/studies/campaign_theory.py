@@ -5,18 +5,28 @@ this file.
 """
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import numpy as np
 
 from ptsmc_jax.campaigns import margin_verdicts, runs, store
 from ptsmc_jax.dispersions.variation import Row
 from ptsmc_jax.simulation import catalogues
+from ptsmc_jax.simulation.requirements import Verdict
 
 if TYPE_CHECKING:
     from tuning.studies.campaign_folder import Folder
 
 FILE = "theory.json"
+
+
+class _Theory(msgspec.Struct):
+    """The content of `theory.json`."""
+
+    lower_bound: float | None
+    margins: list[dict[str, Any]]
 
 
 def write_missing(folder: "Folder") -> None:
@@ -59,5 +69,10 @@ def margins_without_verdict(folder: "Folder", theory: Mapping[str, Any]) -> list
 
 
 def read(folder: "Folder") -> dict[str, Any]:
-    """Return the content of `theory.json`: "lower_bound" and "margins". It is empty if the file cannot be read."""
-    return store.read_json(folder.path / FILE)
+    """Return "lower_bound" and "margins" of `theory.json`, or nothing if the file is missing or damaged."""
+    try:
+        theory = msgspec.json.decode((folder.path / FILE).read_bytes(), type=_Theory)
+        margins = [msgspec.convert(asdict(Verdict.read(entry)), Verdict) for entry in theory.margins]
+    except (OSError, ValueError, TypeError):
+        return {}
+    return {"lower_bound": theory.lower_bound, "margins": [verdict.in_summary() for verdict in margins]}
