@@ -34,6 +34,8 @@ class Controller:
         self.ready: Study = scenarios.study(self.scenario)
         self.reference_input = reference_input  # whether the reference is an input
         self.board: Board = build_board(self.ready.parts, reference_input)
+        for sensor, place in getattr(self.scenario.sensors, "places", {}).items():
+            self.board.meanings[sensor] = f"{place} of scenario.toml. {self.board.meanings[sensor]}"
         self.code: Code = generate(self.board)
         law, device = self.ready.parts.controller, self.ready.parts.actuators
         self.period = float(self.ready.parts.period)  # control period [s]

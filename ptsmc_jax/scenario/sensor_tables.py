@@ -263,6 +263,12 @@ class SensorSuite(Table, frozen=True):
                 sensors[f"{kind}_{counts[kind]}"] = table
         return sensors
 
+    @property
+    def places(self) -> dict[str, str]:
+        """Return the places in a file of the attitude sensors, such as sensors[0], by their names."""
+        places = [place for place, one in self.tables_by_name("sensors").items() if not isinstance(one, Gyro)]
+        return dict(zip(self.attitude, places, strict=True))
+
     def check(self, scenario: "Scenario") -> None:
         """Raise ScenarioError if a sensor is not valid or if the sensors together do not determine the attitude."""
         for place, table in self.tables_by_name("sensors").items():

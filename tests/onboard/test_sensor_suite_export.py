@@ -58,6 +58,14 @@ def columns(library, name):
     return [k for k, column in enumerate(library.columns["in"]) if column.partition("[")[0] == name]
 
 
+def test_comments_name_the_table_of_each_sensor(suite):
+    library, *_ = suite
+    header = (library.folder / f"ptsmc_{library.name}.h").read_text()
+    for place, name in enumerate(("star_tracker_1", "star_tracker_2", "vector_sensor_1", "custom_1")):
+        comment = header.rpartition(f" {name}[")[0].rpartition("/*")[2]
+        assert f"sensors[{place}]" in comment
+
+
 def test_exported_c_with_a_suite_replays_the_simulation(suite):
     """Each sample starts from the simulated state. Outputs and states agree to 1e-12 of their peak."""
     library, given, out, states = suite
