@@ -329,6 +329,19 @@ def test_damaged_part_is_reported_and_simulated_again(command, simulated, tmp_pa
     assert part.with_name(part.name + ".damaged").exists()  # damaged files are renamed, not deleted
 
 
+def test_a_changed_scenario_is_not_reported_as_damaged_trials(command, simulated, tmp_path):
+    scenario = simulated / "scenario.toml"
+    written = scenario.read_text()
+    scenario.write_text(written.replace("\nt_end = ", "\nt_end = 1"))
+    again = "montecarlo", f"{FOLDER}/scenario.toml", "--trials", 250, "--seed", 3, "--out", FOLDER, "--no-figures"
+    for asked in (["summarize", FOLDER], ["worst", FOLDER], ["replay", FOLDER, "--trial", 120], again):
+        error = refused(command, tmp_path, *asked)
+        assert "scenario.toml was changed after the run" in error
+        assert "damaged" not in error
+    scenario.write_text(f"# a comment\n{written}")
+    assert command("summarize", FOLDER, "--no-figures", "--quiet") == (0, "", "")
+
+
 def test_worst_lists_trials_that_replay_reproduces(command, simulated, tmp_path):
     whole = rows_of(simulated)
     code, said, _ = command("worst", FOLDER, "--by", "peak_torque", "-n", 3)

@@ -243,17 +243,17 @@ def test_a_custom_file_runs_again_only_if_it_has_changed(tmp_path):
         systems.load(f"{file}:mine")
 
 
+VERSIONS = '{"command": "montecarlo", "seed": 0, "trials": 20, "precision": 64, "scenario_checksum": ""}'
+
+
 @pytest.mark.parametrize(
     ("name", "text"),
     [
         ("versions.json", "[" * 100_000),
         ("versions.json", "[3]"),
-        ("versions.json", '{"command": "montecarlo", "seed": -1, "trials": 20, "precision": 64}'),
-        ("versions.json", '{"command": "montecarlo", "seed": 0, "trials": "many", "precision": 64}'),
-        (
-            "versions.json",
-            '{"command": "montecarlo", "seed": 0, "trials": 20, "precision": 64, "metrics": "m\\u0000.py:f"}',
-        ),
+        ("versions.json", VERSIONS.replace('"seed": 0', '"seed": -1')),
+        ("versions.json", VERSIONS.replace("20", '"many"')),
+        ("versions.json", VERSIONS.replace("}", ', "metrics": "m\\u0000.py:f"}')),
         ("scenario.toml", 'plant = { kind = "system", system = "my\\u001b[2K.py:mine" }'),
         ("scenario.toml", f"plant = {'[' * 9}{']' * 9}"),
         ("scenario.toml", "plant = 3"),
@@ -263,8 +263,7 @@ def test_a_custom_file_runs_again_only_if_it_has_changed(tmp_path):
 def test_inconsistent_result_folders_are_refused_in_one_sentence(command, tmp_path, name, text):
     folder = tmp_path / "theirs"
     folder.mkdir()
-    said = '{"command": "montecarlo", "seed": 0, "trials": 20, "precision": 64}'
-    for each, content in {"versions.json": said, "scenario.toml": "", "summary.json": "{}", name: text}.items():
+    for each, content in {"versions.json": VERSIONS, "scenario.toml": "", "summary.json": "{}", name: text}.items():
         (folder / each).write_text(content)
     for asked in (["summarize"], ["worst"], ["replay", "--trial", "1"], ["report"]):
         if name == "summary.json" and asked != ["report"]:

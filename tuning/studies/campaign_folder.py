@@ -48,6 +48,7 @@ class CampaignVersions(msgspec.Struct, frozen=True):
     seed: Annotated[int, Meta(ge=0, lt=2**32)]
     trials: Annotated[int, Meta(ge=1, le=2**32)]
     precision: Literal[32, 64]
+    scenario_checksum: str
     metrics: str | None = None
     metrics_names: tuple[str, ...] | None = None
     run_table: str | None = None  # file name of the run table
@@ -101,10 +102,21 @@ class Folder:
     def versions(self) -> dict[str, object]:
         """The content of `versions.json`."""
         names = None if self.custom_metrics is None else self.custom_metric_names
-        entries = {**self.identity, "trials": self.trials, "metrics_names": names, "run_table": self.table_name}
+        entries = {
+            **self.identity,
+            "scenario_checksum": self.scenario_checksum,
+            "trials": self.trials,
+            "metrics_names": names,
+            "run_table": self.table_name,
+        }
         if self.controller is not None:
             entries |= {C_FOLDER: C_FOLDER, "controller_otherwise": self.parameter_differences or None}
         return store.versions(**{name: value for name, value in entries.items() if value is not None})
+
+    @property
+    def scenario_checksum(self) -> str:
+        """The checksum of the scenario with all defaults."""
+        return rows.campaign_key(parsing.dump(self.scenario), {}).hex()
 
     @cached_property
     def custom_metric_names(self) -> list[str]:
@@ -247,11 +259,21 @@ class Folder:
         """Return the parts of the rows, if there are any. Raises RefusedError if a part is damaged."""
         parts, broken = self.rows.parts()
         if broken:
+            self.check_scenario()
             raise RefusedError(
                 f"{broken[0]} is damaged or of another campaign; "
                 "`ptsmc montecarlo` with the same options simulates it again"
             )
         return parts
+
+    def check_scenario(self) -> None:
+        """Raise RefusedError if the scenario in an existing folder has changed since the campaign began."""
+        if self.stored_versions is not None and self.stored_versions.scenario_checksum != self.scenario_checksum:
+            file = self.path / "scenario.toml"
+            raise RefusedError(
+                f"{file} was changed after the run, so the trials in {self.path} do not belong to it; undo the change, "
+                f"or simulate the changed scenario in another folder with `ptsmc montecarlo {file} --out DIR`"
+            )
 
     def intact_parts(self) -> list[Part]:
         """Return the parts of the rows. Raises RefusedError if a part is damaged, or if there are none."""
@@ -307,6 +329,7 @@ def _contains_campaign(folder: Folder, tables: Mapping[str, object]) -> bool:
     checksum_names = [name for name in store.read_versions(path) if name == "metrics" or name.endswith("_sha256")]
     store.refuse_other_run(path, tables, {**dict.fromkeys(checksum_names), **folder.identity, **store.packages()})
     earlier = open_folder(path)
+    earlier.check_scenario()
     if earlier.trials > folder.trials:
         raise RefusedError(
             f"--trials is {folder.trials}, but must be at least {earlier.trials}, the number of trials in {path}"
