@@ -122,17 +122,17 @@ def _check_loop(scenario: Scenario) -> None:
         scenario.require_sampled_loop(f"controller.kind = {errors.show(controller.kind)}")
     controller.check(scenario)
     if scenario.sampled and t_f <= loop.period:  # checked before delta, which must be at least one period
-        raise wrong("controller.t_f", t_f, f"greater than one control period, loop.period = {loop.period}")
+        raise wrong("controller.t_f", t_f, f"greater than one control period, loop.period = {loop.period} s")
     if delta >= t_f:
-        raise wrong("controller.delta", delta, f"less than controller.t_f, {t_f}")
+        raise wrong("controller.delta", delta, f"less than controller.t_f, {t_f} s")
     if scenario.end < (t_f + window) * (1 - 1e-9):  # the default t_end is later, so the file has a t_end
-        needed = f"at least controller.t_f + loop.window, {t_f:g} + {window:g} = {t_f + window:g}"
+        needed = f"at least controller.t_f + loop.window, {t_f:g} + {window:g} = {t_f + window:g} s"
         raise wrong("loop.t_end", loop.t_end, needed)
     if scenario.sampled:
         _check_periods(scenario)
     elif window < SHORTEST_WINDOW * t_f:
         raise wrong(
-            "loop.window", window, f"at least {SHORTEST_WINDOW * t_f:.6g}, controller.t_f times {SHORTEST_WINDOW}"
+            "loop.window", window, f"at least {SHORTEST_WINDOW * t_f:.6g} s, controller.t_f times {SHORTEST_WINDOW}"
         )
     for key in scenario.hardware.__struct_fields__ if scenario.hardware is not None else ():
         if getattr(scenario.hardware, key) is not None:
@@ -150,14 +150,14 @@ def _check_periods(scenario: Scenario) -> None:
     loop, window, command_filter = scenario.loop, scenario.window, scenario.devices.command_filter
     delta = scenario.hand_over
     if delta < loop.period * (1 - 1e-9):
-        raise wrong("controller.delta", delta, f"at least one control period, loop.period = {loop.period}")
+        raise wrong("controller.delta", delta, f"at least one control period, loop.period = {loop.period} s")
     if scenario.end / loop.period > MOST_STEPS:
-        raise wrong("loop.period", loop.period, f"at least loop.t_end / {MOST_STEPS}, {scenario.end / MOST_STEPS}")
+        raise wrong("loop.period", loop.period, f"at least loop.t_end / {MOST_STEPS}, {scenario.end / MOST_STEPS} s")
     if command_filter is not None and command_filter.corner >= math.pi / loop.period:
         highest = f"below pi / loop.period = {math.pi / loop.period:.6g} rad/s, the Nyquist frequency"
         raise wrong("hardware.command_filter.corner", command_filter.corner, highest)
     if window < loop.period * (1 - 1e-9):
-        raise wrong("loop.window", window, f"at least one control period, loop.period = {loop.period}")
+        raise wrong("loop.window", window, f"at least one control period, loop.period = {loop.period} s")
     delay, t_f = scenario.devices.delay_periods, scenario.controller.t_f
     if delay * loop.period >= t_f:
         allowed = f"a number of control periods ({loop.period:g} s each) that is shorter than controller.t_f, {t_f:g} s"
@@ -168,7 +168,7 @@ def _check_periods(scenario: Scenario) -> None:
         raise wrong("hardware.star_tracker_every", every, f"at most the {samples} control periods until loop.t_end")
     tracker_period = getattr(scenario.hardware, "star_tracker_period", None) or 0.0
     if tracker_period > scenario.end:
-        raise wrong("hardware.star_tracker_period", tracker_period, f"at most loop.t_end, {scenario.end}")
+        raise wrong("hardware.star_tracker_period", tracker_period, f"at most loop.t_end, {scenario.end} s")
 
 
 def _check_dispersion(scenario: Scenario) -> None:
@@ -181,11 +181,11 @@ def _check_dispersion(scenario: Scenario) -> None:
     for key, needed in _absent_needs(scenario).items():
         if key in random:
             raise ScenarioError(f"dispersion.{key} needs {needed}")
-    for low, high in (("min_deg", "max_deg"), ("earliest", "latest"), ("smallest", "largest")):
+    for low, high, unit in (("min_deg", "max_deg", " deg"), ("earliest", "latest", " s"), ("smallest", "largest", "")):
         for name, table in random.items():
             smallest, largest = getattr(table, low, None), getattr(table, high, None) or scenario.end
             if smallest is not None and smallest > largest:
-                raise wrong(f"dispersion.{name}.{low}", smallest, f"at most {high}, {largest}")
+                raise wrong(f"dispersion.{name}.{low}", smallest, f"at most {high}, {largest}{unit}")
     if "timing_jitter" in random and not random["timing_jitter"].largest < 0.5:
         raise wrong(
             "dispersion.timing_jitter.largest", random["timing_jitter"].largest, "below 0.5, half a control period"

@@ -195,7 +195,7 @@ class Hardware(Actuators, frozen=True):
         if tracker_period is not None and every is not None:
             raise wrong("hardware.star_tracker_period", tracker_period, "absent if star_tracker_every is given")
         if tracker_period is not None and tracker_period < period * (1.0 - INTEGER_TOLERANCE):
-            raise wrong("hardware.star_tracker_period", tracker_period, f"at least loop.period, {period}")
+            raise wrong("hardware.star_tracker_period", tracker_period, f"at least loop.period, {period} s")
         if self.periods_per_sample(period) != 1 and not scenario.estimator.on:
             key, value, smallest = ("every", every, 1) if tracker_period is None else ("period", tracker_period, period)
             allowed = f'{smallest}, or [filter] with kind = "steady_state"'

@@ -268,9 +268,9 @@ class PrescribedTimeTable(LinearTable, frozen=True):
         """Raise ScenarioError unless delta_o < t_o <= t_f: the observer must have converged before t_f."""
         table, t_f = self.complete_for_file(scenario), scenario.controller.t_f
         if table.t_o > t_f:
-            raise wrong("observer.t_o", table.t_o, f"at most controller.t_f, {t_f}")
+            raise wrong("observer.t_o", table.t_o, f"at most controller.t_f, {t_f} s")
         if table.delta_o >= table.t_o:
-            raise wrong("observer.delta_o", table.delta_o, f"less than observer.t_o, {table.t_o}")
+            raise wrong("observer.delta_o", table.delta_o, f"less than observer.t_o, {table.t_o} s")
 
 
 class FiniteTimeTable(ObserverTable, frozen=True):

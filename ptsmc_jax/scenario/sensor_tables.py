@@ -72,9 +72,9 @@ class AttitudeSensorTable(SensorTable, frozen=True):
         attitude_keys.check_direction(f"{place}.boresight", self.boresight or (0.0, 0.0, 1.0))
         control_period = scenario.loop.period
         if self.period is not None and self.period < control_period * (1.0 - attitude_sensors.INTEGER_TOLERANCE):
-            raise wrong(f"{place}.period", self.period, f"at least loop.period, {control_period}")
+            raise wrong(f"{place}.period", self.period, f"at least loop.period, {control_period} s")
         if self.period is not None and self.period > scenario.end:
-            raise wrong(f"{place}.period", self.period, f"at most loop.t_end, {scenario.end}")
+            raise wrong(f"{place}.period", self.period, f"at most loop.t_end, {scenario.end} s")
         latest = MAX_LATENCY_PERIODS * control_period
         if self.latency > latest:
             raise wrong(

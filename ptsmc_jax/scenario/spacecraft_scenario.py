@@ -172,7 +172,7 @@ class Pointing(Table, frozen=True):
         attitude_keys.check_direction("pointing.boresight", self.boresight)
         t_f, needed = scenario.controller.t_f, scenario.controller.t_f + self.time_after_t_f
         if scenario.end < needed * (1 - 1e-9):  # the default t_end is later, so the file has a t_end
-            numbers = f"{t_f:g} + {self.after:g} + 2 * {self.window:g} = {needed:g}"
+            numbers = f"{t_f:g} + {self.after:g} + 2 * {self.window:g} = {needed:g} s"
             reason = f"at least controller.t_f + pointing.after + 2 pointing.window, {numbers}"
             raise wrong("loop.t_end", scenario.end, reason)
         sampled = scenario.sampled
@@ -182,7 +182,7 @@ class Pointing(Table, frozen=True):
         if sampled and jitter is not None:  # a period may begin early and end late
             shortest, source = shortest * (1.0 + 2.0 * jitter.largest), "the longest control period with its jitter"
         if self.window < shortest * (1 - 1e-9):
-            raise wrong("pointing.window", self.window, f"at least {source}, {shortest:.9g}")
+            raise wrong("pointing.window", self.window, f"at least {source}, {shortest:.9g} s")
 
     def build(self, scenario: Any) -> PointingPart:
         """Return `pointing.Pointing`, with the limits whose requirements concern a fraction of the time."""

@@ -172,7 +172,7 @@ def _count_substeps(scenario: Scenario, period: float, frequencies: Mapping[str,
     frequencies = {key: value / (4 if key in _SMOOTH_MOTIONS else 1) for key, value in frequencies.items()}
     needed = period * _fastest_frequency(frequencies) / 0.025
     if needed > MOST_SUBSTEPS:
-        reason = f"loop.period = {period} would take more than {MOST_SUBSTEPS} integration steps a period"
+        reason = f"loop.period = {period} s would take more than {MOST_SUBSTEPS} integration steps a period"
         raise _too_fast_error(scenario, max(frequencies, key=lambda key: frequencies[key]), reason)
     count = max(1, math.ceil(needed))
     # round up to a power of 2 or 1.5 times one: nearly all gains then share one compiled program
