@@ -197,7 +197,9 @@ class Hardware(Actuators, frozen=True):
         if tracker_period is not None and tracker_period < period * (1.0 - INTEGER_TOLERANCE):
             raise wrong("hardware.star_tracker_period", tracker_period, f"at least loop.period, {period} s")
         if self.periods_per_sample(period) != 1 and not scenario.estimator.on:
-            key, value, smallest = ("every", every, 1) if tracker_period is None else ("period", tracker_period, period)
+            key, value, smallest = "period", tracker_period, f"{period} s"
+            if tracker_period is None:
+                key, value, smallest = "every", every, "1"
             allowed = f'{smallest}, or [filter] with kind = "steady_state"'
             reason = f", but without a filter the law needs a sample every period; allowed is {allowed}"
             raise errors.value_error(f"hardware.star_tracker_{key}", value, reason, allowed)
@@ -389,7 +391,7 @@ class WheelLimits(Table, frozen=True):
             raise wrong("wheels.momentum", self.momentum, errors.list_of(len(axes), "wheel"))
         limit = self.momentum_limit
         if limit is not None and any(abs(h) > limit for h in self.momentum or ()):
-            raise wrong("wheels.momentum", self.momentum, f"within wheels.momentum_limit, {limit}")
+            raise wrong("wheels.momentum", self.momentum, f"within wheels.momentum_limit, {limit} N m s")
 
     def build(self) -> Wheels:
         """Return the reaction wheels of this table, a `devices.actuators.Wheels`."""

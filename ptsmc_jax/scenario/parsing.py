@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
+import numpy as np
 
 from ptsmc_jax.scenario import (
     attitude_keys,
@@ -459,6 +460,29 @@ def _to_numbers(value: Any, units: Mapping[str, float]) -> Any:
         # the nearest double: 20 * 1e-6 in floating point is not 2e-5
         return float(_DECIMAL.multiply(_DECIMAL.create_decimal(number), Decimal(str(units[unit]))))
     return tuple(_to_numbers(one, units) for one in value) if isinstance(value, list | tuple) else value
+
+
+def as_written(error: ScenarioError, raw: Mapping[str, Any]) -> ScenarioError:
+    """Return the error of a key, with its value as the file gives it if the file gives a unit.
+
+    >>> str(as_written(wrong("loop.period", 0.05, "at least 0.1 s"), {"loop": {"period": "50 ms"}}))
+    'loop.period is "50 ms" (0.05 s), but must be at least 0.1 s'
+    """
+    written: Any = raw
+    try:
+        for name in re.findall(r"[^.\[\]]+", error.key):
+            written = written[int(name) if isinstance(written, list | tuple) else name]
+    except (KeyError, IndexError, TypeError, ValueError):  # the file does not have this key
+        return error
+    value, plain = _to_numbers(error.value, {}), _to_numbers(written, {})
+    for unit, units in catalogues.UNITS.items():
+        if plain != value == _to_numbers(written, units):
+            shown = brief(written)
+            if value != _to_numbers(written, dict.fromkeys(units, 1.0)):
+                shown += f" ({', '.join(f'{one:.6g}' for one in np.ravel(value))} {unit})"
+            text = str(error).replace(brief(error.value), shown, 1)
+            return ScenarioError(text, key=error.key, value=error.value, allowed=error.allowed)
+    return error
 
 
 def _find_non_finite(value: object) -> float | int | None:

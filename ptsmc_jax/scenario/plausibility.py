@@ -80,7 +80,7 @@ def _implausible_noise(scenario: Scenario) -> Iterator[str]:
     gyro_keys = ("rate_noise", "rate_noise_density", "rate_bias", "rate_bias_walk")
     if noise and scenario.sensors is None and all(getattr(device, name) is None for name in gyro_keys):
         yield (
-            f"hardware.attitude_noise is {noise:g}, but the gyro has no error: the law measures the true rate; "
+            f"hardware.attitude_noise is {noise:g} rad, but the gyro has no error: the law measures the true rate; "
             "set hardware.rate_noise or rate_noise_density, or rate_noise = 0 to confirm a perfect gyro"
         )
     noises = {"hardware.attitude_noise": noise}

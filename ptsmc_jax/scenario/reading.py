@@ -43,10 +43,13 @@ def from_tables(raw: Mapping[str, Any], *, run: bool = False) -> Scenario:
     if not isinstance(raw, Mapping):
         actual = f"this is a {type(raw).__name__}"
         raise TypeError(f'tables are needed, such as {{"controller": {{"t_f": 35.0}}}}, but {actual}')
-    scenario = resolve(parsing.parse(raw, run_code=run))
-    checks.check_keys(scenario)
-    if scenario.tune is not None and not custom.has_unloaded_code(scenario):
-        scenario = msgspec.structs.replace(scenario, tune=free_gains.resolve(scenario, scenario.tune))
+    try:
+        scenario = resolve(parsing.parse(raw, run_code=run))
+        checks.check_keys(scenario)
+        if scenario.tune is not None and not custom.has_unloaded_code(scenario):
+            scenario = msgspec.structs.replace(scenario, tune=free_gains.resolve(scenario, scenario.tune))
+    except ScenarioError as error:
+        raise parsing.as_written(error, raw) from None
     return msgspec.structs.replace(scenario, defaulted=parsing.unstated_values(raw, parsing.dump(scenario)))
 
 

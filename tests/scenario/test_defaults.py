@@ -403,7 +403,7 @@ def test_a_custom_disturbance_that_disperses_an_unknown_field_is_refused(drawn, 
 )
 def test_a_noisy_star_tracker_with_a_perfect_gyro_causes_a_warning(hardware, said):
     found = plausibility.warnings(scenario.from_tables({"loop": {"mode": "sampled"}, "hardware": hardware}))
-    assert [one for one in found if "hardware.attitude_noise is 2e-05" in one and "true rate" in one] == found
+    assert [one for one in found if "hardware.attitude_noise is 2e-05 rad" in one and "true rate" in one] == found
     assert bool(found) == said
 
 
