@@ -1,7 +1,8 @@
 """Warn about valid scenarios whose values are probably mistakes. Start with `warnings`.
 
 Three warnings concern noise: disturbance bounds far from the disturbance, noisy estimates, a missing gyro error. The
-others concern values in wrong units, a sliding surface too fast for the period, and a ground target below the horizon.
+others concern values in wrong units, an inertia that the torque limits contradict, a sliding surface too fast for the
+period, and a ground target below the horizon.
 """
 
 from collections.abc import Iterator
@@ -16,6 +17,8 @@ from ptsmc_jax.theory import stability_limits
 # largest ratio of a stated bound to the bound of the disturbance, or its inverse, without a warning
 MAX_BOUND_RATIO = 10.0
 MAX_DELAY_FRACTION = 0.1  # delay as a fraction of t_f; a longer one was probably given in seconds
+MAX_TORQUE_RATIO = 100.0  # torque of the slew relative to the limit; an inertia in kg cm^2 is wrong by 1e4
+MAX_TURN = 1.0  # largest turn in one control period [rad]; for real spacecraft it is a few mrad
 MAX_ATTITUDE_NOISE = np.deg2rad(5.0)  # noise [rad]; a larger one was probably given in another unit
 
 
@@ -28,7 +31,13 @@ def warnings(scenario: Scenario) -> list[str]:
     bound_warnings = (
         () if bounds is None else (*_implausible_bound(scenario, *bounds), *_noisy_estimate(scenario, bounds[0]))
     )
-    checks = (_implausible_noise, _delay_in_seconds, _unstable_surface_rate, _target_below_horizon)
+    checks = (
+        _implausible_inertia,
+        _implausible_noise,
+        _delay_in_seconds,
+        _unstable_surface_rate,
+        _target_below_horizon,
+    )
     return [*bound_warnings, *(warning for check in checks for warning in check(scenario))]
 
 
@@ -42,6 +51,31 @@ def _target_below_horizon(scenario: Scenario) -> Iterator[str]:
                 f"reference.kind is {errors.show(reference.kind)}, but at t = {t:.4g} s the Earth hides the target: "
                 f"seen from there the spacecraft is {-np.rad2deg(elevation):.3g} deg below the horizon"
             )
+
+
+def _implausible_inertia(scenario: Scenario) -> Iterator[str]:
+    """Warn if the torque limits contradict the inertia: almost no slew is possible, or a large turn in one period.
+
+    A turn by the angle a in the time t needs at least the acceleration 4 a / t^2: half of the time each to speed up
+    and to slow down.
+    """
+    any_scenario: Any = scenario
+    limit = scenario.largest_acceleration() if scenario.motion == "spacecraft" else None
+    if limit is None:
+        return
+    acceleration, period = 2.0 * limit, scenario.loop.period  # [rad/s^2], since the error is tan(angle / 2)
+    beginning = f"spacecraft.inertia is {errors.brief(any_scenario.spacecraft.inertia)} kg m^2: "
+    units = "check the units, 1 kg m^2 is 1e4 kg cm^2 or 1e7 g cm^2"
+    angle, t_f = any_scenario.start_angle(), scenario.controller.t_f
+    needed = 4.0 * angle / t_f**2
+    if needed > MAX_TORQUE_RATIO * acceleration:
+        yield (
+            f"{beginning}the turn by {np.rad2deg(angle):.3g} deg in controller.t_f = {t_f:g} s needs at least "
+            f"{needed:.3g} rad/s^2, but the torque limit allows {acceleration:.3g} rad/s^2; {units}"
+        )
+    turn = 0.5 * acceleration * period**2
+    if turn > MAX_TURN:
+        yield f"{beginning}the torque limit turns the body by {turn:.3g} rad in one period, {period:g} s; {units}"
 
 
 def _delay_in_seconds(scenario: Scenario) -> Iterator[str]:

@@ -16,6 +16,7 @@ from ptsmc_jax.scenario import disturbance_tables, free_gains, parsing, plausibi
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.signals.disturbances import Disturbance
 from tests.helpers import FULL_INERTIA
+from tests.tree import ROOT
 from tuning.search import gains
 
 CUBESAT = [0.05, 0.08, 0.11]
@@ -405,6 +406,24 @@ def test_a_noisy_star_tracker_with_a_perfect_gyro_causes_a_warning(hardware, sai
     found = plausibility.warnings(scenario.from_tables({"loop": {"mode": "sampled"}, "hardware": hardware}))
     assert [one for one in found if "hardware.attitude_noise is 2e-05 rad" in one and "true rate" in one] == found
     assert bool(found) == said
+
+
+@pytest.mark.parametrize(
+    ("factor", "said"),
+    [(1e7, "torque limit allows"), (1e4, "torque limit allows"), (1.0, None), (1e-7, "rad in one")],
+)
+@pytest.mark.parametrize("actuators", [{"hardware": {"torque_limit": 0.01}}, {"wheels": {"torque_limit": 0.01}}])
+def test_an_inertia_in_another_unit_contradicts_the_torque_limit(factor, said, actuators):
+    tables = {"spacecraft": {"inertia": [0.5 * factor] * 3}, "controller": {"t_f": 60.0}, "loop": {"mode": "sampled"}}
+    found = [one for one in plausibility.warnings(scenario.from_tables({**tables, **actuators})) if "kg cm^2" in one]
+    assert [said in one for one in found] == ([] if said is None else [True])
+
+
+@pytest.mark.parametrize(
+    "path", sorted(ROOT.glob("scenarios/*.toml")) + sorted(ROOT.glob("benchmarks/satellites/*.toml"))
+)
+def test_the_scenarios_of_the_repository_cause_no_warning(path):
+    assert not plausibility.warnings(scenario.read(path))
 
 
 @pytest.mark.parametrize(("delay", "said"), [(0, False), (59, False), (60, True), (599, True)])
