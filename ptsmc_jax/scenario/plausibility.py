@@ -8,6 +8,7 @@ period, and a ground target below the horizon.
 from collections.abc import Iterator
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from ptsmc_jax.scenario import disturbance_tables, errors
@@ -148,9 +149,15 @@ def _implausible_bound(scenario: Scenario, bound: float, rate_bound: float) -> I
 
 
 def _noisy_estimate(scenario: Scenario, disturbance_bound: float) -> Iterator[str]:
-    """Warn about an observer whose estimate has more noise than the disturbance has amplitude."""
+    """Warn about an observer whose estimate has more noise than the disturbance has amplitude.
+
+    The default gain is as small as is useful, see `mission.design`, so only a larger gain causes the warning.
+    """
     noise = estimate_noise(scenario)
     if noise > disturbance_bound > 0.0:
+        default: Any = msgspec.structs.replace(scenario.observer, gain=None).fill_defaults(scenario)
+        if max(scenario.observer.gain) <= 1.001 * max(default.gain):
+            return
         shown = errors.brief([float(f"{one:.4g}") for one in scenario.observer.gain])
         unit = " N m" if scenario.motion == "spacecraft" else ""
         yield (

@@ -292,6 +292,17 @@ def test_an_estimate_with_more_noise_than_the_disturbance_causes_a_warning(share
     assert any("try a smaller gain" in one for one in plausibility.warnings(scenario.from_tables(tables))) is said
 
 
+@pytest.mark.parametrize("rate_noise", [1e-3, 1e-1])
+def test_the_default_gain_of_the_observer_causes_no_warning(rate_noise):
+    """No smaller gain helps: within t_f the estimate must approach the disturbance."""
+    tables = {**NOISY, "hardware": {"attitude_noise": 1e-5, "rate_noise": rate_noise}}
+    default = scenario.from_tables(tables)
+    for same in (default, scenario.from_tables(parsing.dump(default))):
+        assert not any("try a smaller gain" in one for one in plausibility.warnings(same))
+    larger = scenario.replace(default, observer__gain=[1e3 * gain for gain in default.observer.gain])
+    assert any("try a smaller gain" in one for one in plausibility.warnings(larger))
+
+
 def test_the_predicted_noise_of_the_estimate_matches_the_observer():
     """Run the digital observer on 40000 samples of noise. Chance changes an axis by at most 1 % (3 sigma)."""
     gain, h, sigma = [0.05, 0.2, 1.0], 0.1, 1e-4
