@@ -24,7 +24,7 @@ from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.scenario import errors
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.schema import PartTable, make_table
-from ptsmc_jax.scenario.values import Kinds, Meaning, NotNegative, NotNegatives, Positive, Table, Three
+from ptsmc_jax.scenario.values import Kinds, Meaning, NotNegative, NotNegatives, Positive, Table, Three, rounded
 
 if TYPE_CHECKING:
     from ptsmc_jax.scenario.tables import Scenario
@@ -329,7 +329,7 @@ class SteadyStateFilter(FilterTable, frozen=True):
         if self.bandwidth is not None or not all(noises):
             return self
         bandwidth = formulas.best_bandwidth(*noises, period, table.interval(period))
-        return msgspec.structs.replace(self, bandwidth=bandwidth)
+        return msgspec.structs.replace(self, bandwidth=rounded(bandwidth))
 
     def immediate_noise_fraction(self, scenario: "Scenario") -> float:
         """Return the attitude gain of a correction, see `devices.attitude_filter.filter_gains`."""

@@ -27,7 +27,7 @@ from ptsmc_jax.scenario.attitude_keys import Attitude
 from ptsmc_jax.scenario.custom import Custom, custom_kind, fastest_rate
 from ptsmc_jax.scenario.errors import ScenarioError, brief, wrong
 from ptsmc_jax.scenario.schema import PartTable, make_table
-from ptsmc_jax.scenario.values import MOST_STEPS, Meaning, Table
+from ptsmc_jax.scenario.values import MOST_STEPS, Meaning, Table, rounded
 from ptsmc_jax.signals import disturbances
 
 if TYPE_CHECKING:
@@ -308,7 +308,7 @@ def observer_gain(scenario: "Scenario") -> float:
 
     The published gain is 10 N m s for a mean moment of 12 kg m^2.
     """
-    return observer_rate(scenario) * scenario.mean_inertia
+    return rounded(observer_rate(scenario) * scenario.mean_inertia)
 
 
 def has_unloaded_reference(scenario: "Scenario") -> bool:

@@ -12,6 +12,7 @@ from ptsmc_jax.scenario import errors, gain_bounds, parsing, tables
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.gain_bounds import BoundsContext, is_log_scaled
 from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.scenario.values import rounded
 from ptsmc_jax.simulation import catalogues
 
 RESOLVED_FIRST = ("t_f", "p", "surface_rate")  # gains whose bounds determine the bounds of other gains
@@ -160,7 +161,7 @@ def _default_bounds(context: BoundsContext, name: str) -> tuple[float, float]:
             low = (smallest + min(values)) / 2
         if high < max(values) < largest:
             high = min(2 * max(values) - smallest, (max(values) + largest) / 2)
-    return low, high
+    return rounded(low), rounded(high)
 
 
 def _present_values(scenario: Scenario, name: str) -> tuple[float, ...]:
@@ -256,7 +257,8 @@ def widen_bounds(
 
 def usual_bounds(scenario: Scenario, name: str) -> tuple[float, float]:
     """Return the usual bounds of a free gain, before they are widened to include the scenario's gain."""
-    return gain_bounds.bounds_of(scenario, name).usual(_search_context(scenario))
+    low, high = gain_bounds.bounds_of(scenario, name).usual(_search_context(scenario))
+    return rounded(low), rounded(high)
 
 
 def default_bounds(scenario: Scenario, name: str) -> tuple[float, float]:

@@ -21,7 +21,7 @@ from ptsmc_jax.scenario import disturbance_tables, mission
 from ptsmc_jax.scenario.custom import Custom, custom_kind
 from ptsmc_jax.scenario.errors import show, wrong
 from ptsmc_jax.scenario.schema import PartTable, make_table
-from ptsmc_jax.scenario.values import Meaning, NotNegative, Positive
+from ptsmc_jax.scenario.values import Meaning, NotNegative, Positive, rounded
 
 if TYPE_CHECKING:
     from ptsmc_jax.scenario.tables import Scenario
@@ -90,7 +90,9 @@ class LawTable(PartTable, frozen=True):
         """
         bounds = disturbance_tables.largest_disturbance(scenario)
         if bounds is not None:
-            self = self._fill_absent(dict(zip(("disturbance_bound", "disturbance_rate_bound"), bounds, strict=True)))
+            self = self._fill_absent(
+                dict(zip(("disturbance_bound", "disturbance_rate_bound"), map(rounded, bounds), strict=True))
+            )
         filled = self
         if scenario.sampled and not mission.is_published_case(scenario):
             scenario = msgspec.structs.replace(scenario, controller=self)
@@ -282,7 +284,7 @@ class FiniteTimeTable(ObserverTable, frozen=True):
             return self
         rate = scenario.controller.disturbance_rate_bound
         rate = rate or mission.scales(scenario).scaled_value(Scaled(1e-3, inertia=1, time=-1, order=-1))
-        return msgspec.structs.replace(self, gain=(20.0 * rate,) * scenario.inputs)
+        return msgspec.structs.replace(self, gain=(rounded(20.0 * rate),) * scenario.inputs)
 
     def check(self, scenario: "Scenario") -> None:
         """Raise ScenarioError if the gain is below the bound on the disturbance's rate."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from ptsmc_jax.declare import Scaled
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.scenario.values import Table
+from ptsmc_jax.scenario.values import Table, rounded
 
 if TYPE_CHECKING:
     from ptsmc_jax.scenario.tables import Scenario
@@ -70,7 +70,7 @@ class Scales(NamedTuple):
 
 
 def _multiply(value: Any, factor: float) -> Any:
-    return tuple(_multiply(one, factor) for one in value) if isinstance(value, tuple) else factor * value
+    return tuple(_multiply(one, factor) for one in value) if isinstance(value, tuple) else rounded(factor * value)
 
 
 def is_published_case(scenario: Any) -> bool:

@@ -56,3 +56,12 @@ class Table(msgspec.Struct, kw_only=True, frozen=True, omit_defaults=False):
 
 
 Kinds = Mapping[str, type[Table]]  # classes of a table by kind, the default first
+
+
+def rounded(value: float) -> float:
+    """Return a number rounded to 15 digits, which removes the rounding error of a product.
+
+    >>> 3 * 0.1, rounded(3 * 0.1)
+    (0.30000000000000004, 0.3)
+    """
+    return float(f"{value:.15g}")

@@ -152,3 +152,14 @@ def test_designs_are_starting_points_within_the_bounds_or_near():
         gains = said.controller.gains_of(design, said)
         assert said.loop.period <= gains["delta"] < said.controller.t_f
         assert all(value > 0.0 for value in gains.values())
+
+
+@pytest.mark.parametrize("t_f", [30.0, 35.0, 47.0, 60.0])
+@pytest.mark.parametrize("mode", ["continuous", "sampled"])
+def test_defaults_and_bounds_have_no_rounding_errors_in_their_last_digits(mode, t_f):
+    """Products such as 0.30000000000000004 have 17 digits. Designed gains of the sampled loop are irrational."""
+    tables = {"loop": {"mode": mode}, "controller": {"t_f": t_f}, "tune": {}}
+    read = scenario.from_tables(tables)
+    gains = () if mode == "sampled" else (read.controller.sign_width, *read.observer.gain)
+    for value in (read.loop.period, *gains, *np.ravel([*read.search.bounds.values()])):
+        assert value == float(f"{value:.15g}")
