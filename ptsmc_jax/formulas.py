@@ -110,14 +110,11 @@ def wheel_axes(axes: ArrayLike) -> np.ndarray:
     `axes` are directions (n, 3) of any length.
     """
     unit = np.asarray(axes, dtype=float)
-    if (
-        unit.ndim != 2
-        or unit.shape[1] != 3
-        or not np.all(np.isfinite(unit))
-        or np.any(np.linalg.norm(unit, axis=1) == 0)
-    ):
+    with np.errstate(over="ignore"):
+        norms = np.linalg.norm(unit, axis=-1, keepdims=True)
+    if unit.ndim != 2 or unit.shape[1] != 3 or not np.all(np.isfinite(norms) & (norms > 0.0)):
         raise ValueError("allowed are rows of three numbers, a direction for each wheel")
-    unit = unit / np.linalg.norm(unit, axis=1, keepdims=True)
+    unit = unit / norms
     if np.linalg.svd(unit, compute_uv=False)[-1] < 1e-6 or len(unit) < 3:
         raise ValueError("the wheels' axes must span all three directions")
     return unit

@@ -97,7 +97,7 @@ def _rotation(table: Attitude, name: str, key: str, array: np.ndarray) -> "Rotat
 def check_direction(key: str, value: Any) -> None:
     """Raise ScenarioError if a vector (3,) has no direction; `key`: its full key."""
     if not 1e-100 < max(map(abs, value)) < 1e100:
-        raise wrong(key, value, "a direction, three numbers that are not all 0")
+        raise wrong(key, value, "a direction, three numbers that are not all 0, huge or tiny")
 
 
 def stated_keys(table: Attitude) -> list[str]:

@@ -87,7 +87,8 @@ class Actuators(Table, frozen=True):
         """Raise ScenarioError if keys contradict each other or the scenario."""
         step, limit = self.torque_step, self.torque_limit
         if step is not None and limit is not None and step >= 2.0 * limit and getattr(scenario, "wheels", None) is None:
-            allowed = f"less than twice hardware.torque_limit, {limit}: larger ones round every torque to zero"
+            unit = " N m" if scenario.motion == "spacecraft" else ""
+            allowed = f"less than twice hardware.torque_limit, {limit}{unit}: larger ones round every torque to zero"
             raise wrong("hardware.torque_step", step, allowed)
         wheels = scenario.reaction_wheels
         channels = scenario.inputs if wheels is None else len(wheels.spin_axes())

@@ -81,7 +81,7 @@ def show(value: object) -> str:
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(show, value)) + "]"
     if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{show_key(k)} = {show(v)}" for k, v in value.items()) + " }"
+        return "{ " + ", ".join(f"{show_key(k)} = {show(v)}" for k, v in value.items()) + " }" if value else "{}"
     if isinstance(value, int) and value.bit_length() > MOST_BITS:  # Python refuses to print longer whole numbers
         return f"a whole number of {value.bit_length()} bits"
     return str(value)

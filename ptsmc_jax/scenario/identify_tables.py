@@ -99,6 +99,10 @@ def check(identify: Identify | None, telemetry: object) -> None:
     """Raise ScenarioError if keys of the tables contradict each other."""
     if identify is not None and identify.free is not None and len(set(identify.free)) < len(identify.free):
         raise wrong("identify.free", identify.free, "a list of different names")
+    for key in getattr(telemetry, "__struct_fields__", ()):
+        columns = getattr(telemetry, key)
+        if isinstance(columns, tuple) and len(set(columns)) < len(columns):
+            raise wrong(f"telemetry.{key}", columns, "a list of different columns")
     if not isinstance(telemetry, Telemetry):
         return
     input_keys = [key for key in ("torque", "wheel_torque", "wheel_speed") if getattr(telemetry, key) is not None]

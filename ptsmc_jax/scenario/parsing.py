@@ -31,7 +31,7 @@ from ptsmc_jax.scenario import (
     systems,
 )
 from ptsmc_jax.scenario.attitude_keys import ATTITUDE_KEYS, Attitude
-from ptsmc_jax.scenario.errors import MOST_BITS, ScenarioError, brief, show, wrong
+from ptsmc_jax.scenario.errors import MOST_BITS, ScenarioError, brief, show, show_key, wrong
 from ptsmc_jax.scenario.layouts import SCENARIOS, TABLES
 from ptsmc_jax.scenario.tables import Limit, Scenario
 from ptsmc_jax.scenario.values import Kinds, NotNegative, Positive, Table
@@ -192,7 +192,7 @@ def _unknown_table_error(name: str, value: object, kind: str) -> ScenarioError:
     places = [f"{table}.{closest[0]}" for table in tables]
     hint = f"the nearest known {'keys are' if places[1:] else 'key is'} {', '.join(places)}"
     return ScenarioError(
-        f"{name} = {brief(value)} is outside of any table; {hint if places else 'no table has such a key'}"
+        f"{show_key(name)} = {brief(value)} is outside of any table; {hint if places else 'no table has such a key'}"
     )
 
 

@@ -69,6 +69,8 @@ class AttitudeSensorTable(SensorTable, frozen=True):
         super().check(place, scenario)
         if self.boresight is not None and self.rotvec_deg is not None:
             raise wrong(f"{place}.rotvec_deg", self.rotvec_deg, "absent if boresight is given")
+        if self.rotvec_deg is not None:
+            attitude_keys.quaternion(attitude_keys.Attitude(rotvec_deg=self.rotvec_deg), place)
         attitude_keys.check_direction(f"{place}.boresight", self.boresight or (0.0, 0.0, 1.0))
         control_period = scenario.loop.period
         if self.period is not None and self.period < control_period * (1.0 - attitude_sensors.INTEGER_TOLERANCE):

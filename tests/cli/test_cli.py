@@ -206,6 +206,7 @@ NUMBERS = {
         (("simulate", "--quiet=perhaps"), ("--quiet", "perhaps")),
         (("simulate", "s.toml", "t.toml"), ("simulate does not take t.toml", "ptsmc simulate --help")),
         (("montecarl", "s.toml"), ("montecarl", "simulate, reproduce, map, margins, tune")),
+        (("simulate", "huge.toml"), ("reference.rate is [0.0, 0.0, 1e+300]",)),
         (("simulate", "--out", "s.toml"), ("--out is s.toml", "a file", "a new folder")),
         (("simulate", "--out", "s.toml", "--force"), ("--out is s.toml", "a file", "a new folder")),
         (("simulate", "--out", "s.toml/below"), ("--out is s.toml/below", "a new folder")),
@@ -218,6 +219,7 @@ def test_invalid_input_prints_one_line_and_writes_nothing(command, tmp_path, arg
     (tmp_path / "folder" / "mine").write_text("keep")
     (tmp_path / "broken.toml").write_text("x = ")
     (tmp_path / "eta.toml").write_text("[controller]\neta = 1.0")
+    (tmp_path / "huge.toml").write_text('reference = { kind = "spin", rate = [0, 0, 1e300] }')
     (tmp_path / "far.toml").write_text("[initial]\nrotvec_deg = [180.0, 0.0, 0.0]")
     line = refused(command, tmp_path, *args, "--no-figures")
     assert line.startswith("ptsmc: ")
