@@ -52,14 +52,11 @@ class Column(NamedTuple):
         """Return the label of an axis: the name of the column with its unit."""
         return with_unit(name, self.unit)
 
-    def in_readable_unit(self) -> "Column":
-        """Return a column of angles [rad] in arcsec, or in degrees if an angle or the limit is at least one degree."""
-        if self.unit != "rad":
-            return self
+    @property
+    def shown(self) -> np.ndarray:
+        """The finite values, and the limit if there is one."""
         known = self.values[np.isfinite(self.values)]
-        unit, factor = angle_unit(max(np.max(np.abs(known), initial=0.0), self.limit or 0.0))
-        limit = None if self.limit is None else factor * self.limit
-        return self._replace(unit=unit, values=factor * self.values, limit=limit)
+        return known if self.limit is None else np.append(known, self.limit)
 
     def within(self) -> str:
         """Return a text with the limit and the fraction of trials within."""
@@ -68,6 +65,18 @@ class Column(NamedTuple):
         if not self.of_time:
             return f"{limit}: {percent(float(within))} % within"
         return f"{limit}: {percent(float(within))} % of the trials within at all times\n{self.of_time}"
+
+
+def in_readable_units(columns: Mapping[str, Column]) -> dict[str, Column]:
+    """Return columns with all angles [rad] in arcsec, or in degrees if one of them or a limit is one degree or more."""
+    angles = [column for column in columns.values() if column.unit == "rad"]
+    unit, factor = angle_unit(max((np.max(np.abs(column.shown), initial=0.0) for column in angles), default=0.0))
+
+    def converted(column: Column) -> Column:
+        limit = None if column.limit is None else factor * column.limit
+        return column._replace(unit=unit, values=factor * column.values, limit=limit)
+
+    return {name: converted(column) if column.unit == "rad" else column for name, column in columns.items()}
 
 
 def fan(t: np.ndarray, errors: np.ndarray, worst: tuple[int, np.ndarray], t_f: float, kind: str) -> Figure:
@@ -103,9 +112,12 @@ def distributions(metrics: Mapping[str, Column]) -> Figure:
     """Plot the distribution function of each metric, with the limits.
 
     A trial without a value (NaN) counts as larger than all values. The scale is logit: 99.9 % is as far from 99 % as
-    1 % from 10 %.
+    1 % from 10 %. All angles have the same unit.
     """
-    figure = Figure(figsize=(8.0, 3.0 * len(metrics)), layout="constrained")
+    metrics = in_readable_units(metrics)
+    figure = Figure(figsize=(8.0, 0.5 + 3.0 * len(metrics)), layout="constrained")
+    trials = next(iter(metrics.values())).values.size
+    figure.suptitle(f"Distribution functions of {trials} trial{'s' if trials != 1 else ''}")
     rows = figure.subplots(len(metrics), 1, squeeze=False)[:, 0]
     for axes, (name, column) in zip(rows, metrics.items(), strict=True):
         ordered = np.sort(column.values)  # NaN last
@@ -122,12 +134,12 @@ def distributions(metrics: Mapping[str, Column]) -> Figure:
         ticks = [q for k in range(1, 8) for q in (10.0**-k, 1.0 - 10.0**-k) if edge < q < 1.0 - edge]
         axes.set_yticks([0.5, *ticks], [f"{100 * q:.8g} %" for q in (0.5, *ticks)])
         axes.minorticks_off()
-        if known and ordered[0] > 0.0 and ordered[known - 1] > 3.0 * ordered[0]:
+        if known and ordered[0] > 0.0 and column.shown.max() > 3.0 * column.shown.min() > 0.0:
             logarithmic(axes, "x")
         if column.limit is not None:
-            axes.axvline(column.limit, color=STYLES[1][0], ls="--", label=column.within())
-            axes.legend(fontsize=9)
-        axes.set(xlabel=column.label(name), ylabel="fraction of the trials")
+            axes.axvline(column.limit, **LIMIT, label=column.within())
+            axes.legend(fontsize=9, loc="lower left", bbox_to_anchor=(0.0, 1.0))
+        axes.set(xlabel=column.label(name), ylabel="fraction of the trials\nup to this value")
     return figure
 
 
@@ -136,16 +148,19 @@ def torque_by_angle(
     torque: Column,
     outcome: np.ndarray,
     totals: Mapping[str, int],
+    metric: str = "peak_torque",
 ) -> Figure:
-    """Plot peak torque against the initial error, a point a trial.
+    """Plot a peak torque against the initial error, a point a trial.
 
     Args:
         start: initial error of each trial.
         torque: peak torque of each trial.
         outcome: one of `MARKS` for each, (trials,).
         totals: how many trials of the whole campaign have each outcome.
+        metric: name of the metric of `torque`.
     """
-    figure, axes = new_figure("Peak torque by initial error", torque.label("peak torque"))
+    (start,), name = in_readable_units({"": start}).values(), metric.replace("_", " ")
+    figure, axes = new_figure(f"{name.capitalize()} by initial error", torque.label(name))
     _scatter_by_outcome(axes, start.values, torque.values, outcome, totals)
     axes.set_xlabel(start.label("initial angle" if start.unit in ("deg", "arcsec") else "initial error"))
     limit = torque.limit
@@ -168,16 +183,16 @@ def inputs(
     totals: Mapping[str, int],
 ) -> Figure:
     """Plot metrics (rows) against dispersed quantities (columns), a point a trial, see `torque_by_angle`."""
+    drawn, metrics = in_readable_units(drawn), in_readable_units(metrics)
     rows, columns = len(metrics), len(drawn)
     figure = Figure(figsize=(2.9 * columns + 0.8, 2.4 * rows + 0.7), layout="constrained")
     grid = figure.subplots(rows, columns, sharex="col", sharey="row", squeeze=False)
     for line, (metric, column) in zip(grid, metrics.items(), strict=True):
-        known = column.values[np.isfinite(column.values)]
         for axes, x in zip(line, drawn.values(), strict=True):
             _scatter_by_outcome(axes, x.values, column.values, outcome, totals)
             if column.limit is not None:
                 axes.axhline(column.limit, **LIMIT, label="limit")
-            if known.size and known.min() > 0.0 and known.max() > 10.0 * known.min():
+            if column.shown.size and column.shown.max() > 10.0 * column.shown.min() > 0.0:
                 logarithmic(axes, "y")
         line[0].set_ylabel(column.label(metric).replace(" [", "\n["))  # too long for one line
     for axes, (name, x) in zip(grid[-1], drawn.items(), strict=True):

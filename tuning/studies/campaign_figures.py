@@ -36,7 +36,7 @@ def build(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
         stated_unit, limit = units.get(name, ""), limits.get(name)
         unit, values = as_angle(name, stated_unit, values)
         limit = None if limit is None else float(as_angle(name, stated_unit, limit)[1])
-        return plots.Column(unit, values, limit, time_fractions.get(name, "")).in_readable_unit()
+        return plots.Column(unit, values, limit, time_fractions.get(name, ""))
 
     figures: dict[str, Figure] = {}
     if finished.any():
