@@ -558,6 +558,14 @@ def test_driver_explains_a_significant_part_of_the_variance(correlation, trials,
     assert line == (driven if named else NO_DRIVER)
 
 
+def test_percentages_of_correlated_inputs_overlap():
+    """The initial angle and a component of the initial attitude explain 68 % and 52 % of the same variance."""
+    drivers = {"initial_angle": {"rank_correlation": 0.8, "first_order": 0.68}}
+    assert "overlap" not in driver_lines(drivers, 1000)[0]
+    (line,) = driver_lines(drivers | {"initial_q3": {"rank_correlation": -0.1, "first_order": 0.52}}, 1000)
+    assert line.endswith("; these inputs are correlated, so their percentages overlap")
+
+
 @pytest.mark.parametrize(
     ("plant", "objective", "shown", "title"),
     [

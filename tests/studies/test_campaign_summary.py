@@ -1,6 +1,5 @@
 """Requirements on fractions of time, lower bound and margins in the summary and the figures of a campaign."""
 
-import inspect
 import json
 from types import SimpleNamespace
 from typing import Any
@@ -107,22 +106,42 @@ def test_bound_and_margins_use_the_first_trials_and_are_computed_once(tmp_path, 
     assert campaign_theory.read(folder)["lower_bound"] == 1e-6
 
 
-@pytest.mark.parametrize(("required", "shown"), [
-    ("window_angle", ["window_angle [arcsec]", "peak_torque [N m]"]),
-    ("effort", ["effort [N m s]", "window_error [arcsec]", "peak_torque [N m]"]),
-])  # fmt: skip
-def test_the_figure_of_distributions_shows_an_error_once_and_as_an_angle(monkeypatch, required, shown):
+def folder_of_figures(monkeypatch, required):
+    """Return a campaign of 20 trials with a requirement, whose rows all have the same numbers."""
     error = np.linspace(1e-6, 1e-5, 20)
     frame = pl.DataFrame({
         "trial": np.arange(20), "status": ["ok"] * 20, "initial_angle": error, "window_error": error,
-        "window_angle": 2.0 * np.arcsin(error), "peak_torque": error, "effort": error,
+        "window_angle": 2.0 * np.arcsin(error), "peak_torque": error, "peak_torque_delivered": error, "effort": error,
     })  # fmt: skip
     monkeypatch.setattr(campaign_figures.rows, "read", lambda parts, names: frame.select(names))
     folder: Any = SimpleNamespace(
         scenario=scenario.from_tables({"requirements": {required: 5e-5}}), units=catalogues.units("spacecraft"),
         intact_parts=list, trials=20, can_simulate=False,
     )  # fmt: skip
-    figures = inspect.unwrap(campaign_figures.build)(folder, {"verdicts": [], "drivers": {}})
+    return folder
+
+
+def test_figures_show_the_required_torque_and_the_inputs_that_drive_a_metric(monkeypatch):
+    """An earlier version showed peak_torque always, and only the inputs that drive the window error most."""
+    folder = folder_of_figures(monkeypatch, "peak_torque_delivered")
+    weak, strong = ({"rank_correlation": 0.0, "first_order": index} for index in (0.01, 0.6))
+    drivers = {"window_error": {"effort": weak}, "peak_torque_delivered": {"effort": weak, "initial_angle": strong}}
+    summary = {"verdicts": [], "drivers": drivers, "driver_trials": dict.fromkeys(drivers, 1000)}
+    figures = campaign_figures.build(folder, summary)
+    (axes,) = figures["torque_by_angle"].axes
+    assert axes.get_ylabel() == "peak torque delivered [N m]"
+    assert "limit 5e-05 N m" in axes.get_legend_handles_labels()[1]
+    assert [axes.get_xlabel() for axes in figures["inputs"].axes if axes.get_xlabel()] == ["initial_angle [arcsec]"]
+
+
+@pytest.mark.parametrize(("required", "shown"), [
+    ("window_angle", ["window_angle [arcsec]", "peak_torque [N m]"]),
+    ("effort", ["effort [N m s]", "window_error [arcsec]", "peak_torque [N m]"]),
+])  # fmt: skip
+def test_the_figure_of_distributions_shows_an_error_once_and_as_an_angle(monkeypatch, required, shown):
+    folder = folder_of_figures(monkeypatch, required)
+    figures = campaign_figures.build(folder, {"verdicts": [], "drivers": {}})
+    assert "inputs" not in figures
     panels = figures["distributions"].axes
     assert [axes.get_xlabel() for axes in panels] == shown
     points = np.asarray(panels[shown.index(next(name for name in shown if "arcsec" in name))].lines[0].get_xdata())

@@ -142,7 +142,9 @@ def driver_lines(summary: Campaign) -> Iterator[str]:
             correlation = "" if rank is None else f"rank correlation {rank:+.2f}, "
             texts.append(f"{name} ({correlation}{100 * explained[name]:.0f} % of the variance of the ranks)")
         if texts:
-            yield f"{metric} is driven by {', '.join(texts)}"
+            overlap = "; these inputs are correlated, so their percentages overlap"
+            is_overlapping = sum(explained[name] for name in strongest) > 1.0
+            yield f"{metric} is driven by {', '.join(texts)}{overlap if is_overlapping else ''}"
         elif sensitivities:
             unexplained.append(metric)
     if unexplained:

@@ -11,10 +11,12 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import campaign as running
 from ptsmc_jax.campaigns import rows
 from ptsmc_jax.figures import campaign_plots as plots
+from ptsmc_jax.numerics import statistics
 from ptsmc_jax.simulation.catalogues import as_angle, percent, without_norms
 from ptsmc_jax.simulation.requirements import INTERPRETATIONS, Requirement, Verdict
 from tuning.studies.campaign_folder import Folder
 
+TORQUES = ("peak_torque", "peak_torque_delivered", "peak_wheel_torque")  # the first required one is plotted
 FAN_TRIALS = 1000  # largest number of trials whose histories are plotted
 SCATTER_TRIALS = 5000  # largest number of trials in a scatter plot
 
@@ -24,7 +26,8 @@ def build(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
     parts = folder.intact_parts()
     required = scenario.requirements(folder.scenario)
     limits = {r.metric: r.limit for r in required}
-    metrics = dict.fromkeys((*limits, "window_error", "peak_torque"))
+    torque_name = next((name for name in TORQUES if name in limits), TORQUES[0])
+    metrics = dict.fromkeys((*limits, "window_error", torque_name))
     names = without_norms(metrics)
     time_metrics = [r.timed for r in required if r.timed is not None]
     frame = rows.read(parts, ["trial", "status", "initial_angle", *metrics, *time_metrics]).head(folder.trials)
@@ -51,12 +54,11 @@ def build(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
     bad_trials, good_trials = np.flatnonzero(~is_good)[: SCATTER_TRIALS // 2], np.flatnonzero(is_good)
     # failed trials and trials beyond a limit come last, so that their marks are on top
     plotted = np.concatenate([good_trials[: SCATTER_TRIALS - bad_trials.size], bad_trials])
-    angle, torque = (frame[name].to_numpy().astype(float)[plotted] for name in ("initial_angle", "peak_torque"))
+    angle, torque = (frame[name].to_numpy().astype(float)[plotted] for name in ("initial_angle", torque_name))
     if np.isfinite(torque).any():
-        angles, torques = plotted_column("initial_angle", angle), plotted_column("peak_torque", torque)
-        figures["torque_by_angle"] = plots.torque_by_angle(angles, torques, outcome[plotted], totals)
-    drivers = summary["drivers"].get("window_error", {})
-    strongest_inputs = sorted(drivers, key=lambda name: -drivers[name]["first_order"])[:4]
+        angles, torques = plotted_column("initial_angle", angle), plotted_column(torque_name, torque)
+        figures["torque_by_angle"] = plots.torque_by_angle(angles, torques, outcome[plotted], totals, torque_name)
+    strongest_inputs = _strongest_inputs(summary, names[:4])
     if strongest_inputs:
         inputs = rows.read(parts, strongest_inputs)[plotted]
         figures["inputs"] = plots.inputs(
@@ -66,6 +68,17 @@ def build(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
             totals,
         )
     return figures
+
+
+def _strongest_inputs(summary: dict[str, Any], metrics: Sequence[str]) -> list[str]:
+    """Return the inputs that explain one of the metrics best, at most four; see `statistics.explained_variance`."""
+    explained = dict[str, float]()
+    for metric in metrics:
+        for name, driver in summary["drivers"].get(metric, {}).items():
+            fraction = statistics.explained_variance(driver, summary["driver_trials"][metric])
+            explained[name] = max(fraction, explained.get(name, 0.0))
+    named = [name for name, fraction in explained.items() if fraction >= statistics.MIN_EXPLAINED]
+    return sorted(named, key=lambda name: -explained[name])[:4]
 
 
 def _classify_trials(frame: pl.DataFrame, required: Sequence[Requirement]) -> np.ndarray:
