@@ -112,7 +112,10 @@ def wheels(parts: Parts, log: Log, index: int, title: str, quantity: str, unit: 
 
 def sliding(parts: Parts, log: Log) -> Figure:
     """Plot the sliding variable on a log scale, with its envelope before the hand-over (continuous loop, no noise)."""
-    figure, axes = new_figure("Sliding variable", with_unit("|s|", parts.controller.kinematics.error_unit))
+    unit = parts.controller.kinematics.error_unit
+    # other laws define s differently, with other units
+    label = f"|s| [{unit}], after the hand-over [1/s]" if unit and parts.controller.prescribed else "|s|"
+    figure, axes = new_figure("Sliding variable", label)
     _plot_components(axes, log.t, _zeros_to_nan(np.abs(log.s)), "s")
     if parts.controller.prescribed:
         before = log.t[log.t < float(parts.controller.hand_over)]
@@ -128,7 +131,7 @@ def convergence(parts: Parts, log: Log, title: str = "Convergence") -> Figure:
     symbol = parts.controller.kinematics.symbol
     law, n = parts.controller, parts.controller.order
     t_f, eta, delta = float(law.t_f), float(law.eta), float(law.delta)
-    figure, axes = new_figure(title, f"{_error_label(parts)} and |s|")
+    figure, axes = new_figure(title, with_unit(f"{symbol} and |s|", law.kinematics.error_unit))
     before = log.t < float(law.hand_over) * (1 - 1e-12)
     t = np.asarray(log.t)[before]
     tau = t_f - t
@@ -155,7 +158,7 @@ def convergence(parts: Parts, log: Log, title: str = "Convergence") -> Figure:
                       fontsize=10, xytext=(6, shift), textcoords="offset points",
                       ha="left" if shift > 0 else "right")  # fmt: skip
     axes.plot([], [], **EXACT_LINE, label="exact, perfect estimate")
-    axes.set_xlabel("time to go $t_f - t$ [s]")
+    axes.set_xlabel("time to go $t_f - t$ [s], until the hand-over")
     axes.set_ylim(bottom=bottom / 3)
     plain_ticks(axes.xaxis)
     axes.invert_xaxis()

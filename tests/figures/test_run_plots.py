@@ -58,6 +58,13 @@ def test_the_window_that_a_run_is_judged_in_is_shaded():
     np.testing.assert_allclose([placed.x0, placed.x1], [5.0, 5.75], rtol=1e-9)
 
 
+def test_the_sliding_variable_has_its_unit_in_both_phases():
+    """s is (t_f - t) v' + eta v in the approach phase, and v' + c v in the hold phase."""
+    figures = ptsmc_jax.simulate(from_tables(untuned(SHORT))).plot("sliding", "convergence")
+    assert figures["sliding"].axes[0].get_ylabel() == "|s| [-], after the hand-over [1/s]"
+    assert figures["convergence"].axes[0].get_ylabel().endswith("and |s| [-]")
+
+
 @pytest.mark.parametrize(("disturbance", "drawn"), [("none", set()), ("sinusoid", {"error", "sliding"})])
 def test_zeros_are_not_drawn_on_log_axes(disturbance, drawn):
     """A run that begins on its target has zero errors, or errors without an exact solution."""
