@@ -114,7 +114,7 @@ class Simulation:
 
     def plot(self, *names: str) -> "Figures":
         """Return all figures of the run, or the named ones; raise ValueError for an unknown name."""
-        figures = run_plots.run_figures(self.run.parts, self.run.log, self.run.torque_limit, self.run.lower_bound)
+        figures = run_plots.run_figures(self.run.parts, self.run.log, self.run.limits, self.run.lower_bound)
         return Figures(figures).only(names)
 
     def animate(self, frames: int = 40) -> "animation.Animation":

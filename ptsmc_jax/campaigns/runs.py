@@ -43,9 +43,9 @@ class Run:
         return self.status == "ok" and all(v.met for v in self.verdicts)
 
     @property
-    def torque_limit(self) -> float | None:
-        """The scenario's limit on the torque; None if it has no limit."""
-        return next((v.limit for v in self.verdicts if v.metric.startswith("peak_torque")), None)
+    def limits(self) -> dict[str, float]:
+        """The required limits by metric, in the unit of the metric."""
+        return {verdict.metric: verdict.limit for verdict in self.verdicts}
 
     @cached_property
     def lower_bound(self) -> LowerBound | None:

@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from ptsmc_jax.figures.run_plots import draw_error_limits
 from ptsmc_jax.figures.style import (
     LIMIT,
     STYLES,
@@ -21,6 +22,7 @@ from ptsmc_jax.figures.style import (
 from ptsmc_jax.formulas import angle_unit
 from ptsmc_jax.simulation.catalogues import percent
 from ptsmc_jax.simulation.requirements import quantity
+from ptsmc_jax.simulation.rollout import Parts
 
 BANDS = ((99.7, "0.85"), (90.0, "0.68"), (50.0, "0.45"))  # central fraction of the trials [%], grey
 # outcomes of complete runs, which have the status "ok": a limit on a fraction of the time may still be met
@@ -79,17 +81,20 @@ def in_readable_units(columns: Mapping[str, Column]) -> dict[str, Column]:
     return {name: converted(column) if column.unit == "rad" else column for name, column in columns.items()}
 
 
-def fan(t: np.ndarray, errors: np.ndarray, worst: tuple[int, np.ndarray], t_f: float, kind: str) -> Figure:
+def fan(
+    t: np.ndarray, errors: np.ndarray, worst: tuple[int, np.ndarray], parts: Parts, limits: Mapping[str, float]
+) -> Figure:
     """Plot the error of many trials over time: central bands, median, worst run.
 
     Args:
         t: (time,) [s].
         errors: (trials, time) norms of the error, in the unit of this kind of plant.
         worst: the trial of the largest window error, and its errors (time,).
-        t_f: the prescribed time [s].
-        kind: kind of the plant, which determines the unit.
+        parts: parts of the nominal run.
+        limits: required limits by metric, in the unit of the metric.
     """
-    convert, name, unit = error_display(kind)
+    t_f = float(parts.controller.t_f)
+    convert, name, unit = error_display("spacecraft" if parts.controller.kinematics.angle_unit == "rad" else "chain")
     errors, largest = convert(errors), convert(worst[1])
     trials = f"{len(errors)} trial{'s' if len(errors) != 1 else ''}"
     figure, axes = new_figure(f"{name.capitalize()} of {trials}, median in white", with_unit(name, unit))
@@ -103,7 +108,8 @@ def fan(t: np.ndarray, errors: np.ndarray, worst: tuple[int, np.ndarray], t_f: f
     positive = errors[errors > 0.0]
     if positive.size:
         axes.set_ylim(bottom=max(np.percentile(positive, 0.1) / 3.0, positive.max() * 1e-15))
-    axes.legend(fontsize=9)
+    draw_error_limits(axes, parts, limits, float(t[-1]))
+    legend_below(figure, columns=2)
     return figure
 
 

@@ -1,16 +1,28 @@
 """The open loop as figures: Nichols chart, sensitivity, margins against time to go."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ptsmc_jax.figures.style import STYLES, plain_ticks, styled
+from ptsmc_jax.figures.style import LIMIT, STYLES, legend_below, logarithmic, plain_ticks, styled
 from ptsmc_jax.theory.margins import Margins
 
-CONTOUR = 6.0  # sensitivity of the contour [dB]
+CONTOUR = 6.0  # sensitivity of the contour without a required limit [dB]
 LARGEST_SHOWN = 40.0  # |L| is drawn from minus this value to this value [dB]
+MARGIN_UNITS = (("gain_margin", "dB"), ("phase_margin", "deg"))  # margins that a Nichols chart shows
+NO_LIMITS: Mapping[str, float] = MappingProxyType({})
+
+
+def _sensitivity_line(limits: Mapping[str, float], style: str) -> dict[str, Any]:
+    """Return the keywords of the line at the largest allowed sensitivity, or at `CONTOUR` if no limit is required."""
+    limit = limits.get("peak_sensitivity")
+    if limit is None:
+        return {"color": "0.35", "lw": 1.0, "ls": style, "label": f"sensitivity {CONTOUR:g} dB"}
+    return {**LIMIT, "label": f"limit of peak_sensitivity {limit:g} dB"}
 
 
 def _decibels(values: np.ndarray) -> np.ndarray:
@@ -19,8 +31,11 @@ def _decibels(values: np.ndarray) -> np.ndarray:
 
 
 @styled
-def nichols(L: np.ndarray, names: Sequence[str]) -> Figure:
-    """Plot |L| over its phase (points, axes), with the point -1 and the contour of the sensitivity `CONTOUR`."""
+def nichols(L: np.ndarray, names: Sequence[str], limits: Mapping[str, float] = NO_LIMITS) -> Figure:
+    """Plot |L| over its phase (points, axes), with the point -1 and a contour of the sensitivity.
+
+    `limits` are the required margins by name. The curves must not cross the lines of the gain and phase margins.
+    """
     figure = Figure(figsize=(8.0, 5.5), layout="constrained")
     axes = figure.subplots()
     for k, name in enumerate(names):
@@ -29,20 +44,30 @@ def nichols(L: np.ndarray, names: Sequence[str]) -> Figure:
         phase = phase - 360.0 * np.round((phase[crossing] + 180.0) / 360.0)
         colour, style = STYLES[k % len(STYLES)]
         axes.plot(phase, size, color=colour, ls=style, label=name)
-    contour = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 721)) * 10.0 ** (-CONTOUR / 20.0) - 1.0
+    largest = limits.get("peak_sensitivity", CONTOUR)
+    contour = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 721)) * 10.0 ** (-largest / 20.0) - 1.0
     angle = np.rad2deg(np.angle(contour)) % 360.0 - 360.0
-    axes.plot(angle, _decibels(contour), color="0.35", lw=1.0, label=f"sensitivity {CONTOUR:g} dB")
+    axes.plot(angle, _decibels(contour), **_sensitivity_line(limits, "-"))
+    gain, phase = (limits.get(name, np.nan) for name in ("gain_margin", "phase_margin"))
+    axes.plot([-180.0, -180.0], [-gain, gain], **LIMIT)
+    axes.plot([-180.0 - phase, -180.0 + phase], [0.0, 0.0], **LIMIT)
+    required = [f"{name} {limits[name]:g} {unit}" for name, unit in MARGIN_UNITS if name in limits]
+    if required:
+        axes.plot([], [], **LIMIT, label=f"limits of {', '.join(required)}")
     axes.plot(-180.0, 0.0, "+", color="0.0", ms=12, mew=1.6)
     axes.xaxis.set_major_locator(MaxNLocator(9, steps=[1, 4.5, 9, 10]))  # multiples of 45 or 90 deg
     axes.set(xlabel="phase of L [deg]", ylabel="|L| [dB]", ylim=(-LARGEST_SHOWN, LARGEST_SHOWN))
     axes.set_title("Nominal loop, opened at the plant's input, hold phase", loc="left")
-    axes.legend()
+    legend_below(figure, columns=3)
     return figure
 
 
 @styled
-def sensitivity(w: np.ndarray, L: np.ndarray, names: Sequence[str]) -> Figure:
-    """Plot |S| = |1 / (1 + L)| and |T| = |L / (1 + L)| over the frequency w [rad/s]; L (points, axes)."""
+def sensitivity(w: np.ndarray, L: np.ndarray, names: Sequence[str], limits: Mapping[str, float] = NO_LIMITS) -> Figure:
+    """Plot |S| = |1 / (1 + L)| and |T| = |L / (1 + L)| over the frequency w [rad/s]; L (points, axes).
+
+    `limits` are the required margins by name.
+    """
     figure = Figure(figsize=(8.0, 4.5), layout="constrained")
     axes = figure.subplots()
     is_shown, largest = w > w[-1] * 1e-4, 0.0
@@ -52,7 +77,7 @@ def sensitivity(w: np.ndarray, L: np.ndarray, names: Sequence[str]) -> Figure:
             size = _decibels(transfer)
             axes.semilogx(w[is_shown], size[is_shown], color=colour, ls=style, label=f"{letter} {name}")
             largest = max(largest, size[is_shown].max())
-    axes.axhline(CONTOUR, color="0.35", lw=1.0, ls=":", label=f"{CONTOUR:g} dB")
+    axes.axhline(limits.get("peak_sensitivity", CONTOUR), **_sensitivity_line(limits, ":"))
     axes.set(xlabel="frequency [rad/s]", ylabel="magnitude [dB]", ylim=(-LARGEST_SHOWN, largest + 15.0))
     axes.set_title("Sensitivity S and complementary sensitivity T, nominal loop, hold phase", loc="left")
     axes.legend(ncols=len(names) + 1)
@@ -60,7 +85,13 @@ def sensitivity(w: np.ndarray, L: np.ndarray, names: Sequence[str]) -> Figure:
 
 
 @styled
-def margins_over_time(time_to_go: np.ndarray, judged: np.ndarray, before: Margins, hold: Margins) -> Figure:
+def margins_over_time(
+    time_to_go: np.ndarray,
+    judged: np.ndarray,
+    before: Margins,
+    hold: Margins,
+    limits: Mapping[str, float] = NO_LIMITS,
+) -> Figure:
     """Plot the margins of the worst axis against time to go, and of the hold phase as lines.
 
     Times before the first judged sample and after the last one are grey.
@@ -70,8 +101,9 @@ def margins_over_time(time_to_go: np.ndarray, judged: np.ndarray, before: Margin
         judged: whether a requirement judges the margins at each time, bool (times,).
         before: margins at these times (times, axes).
         hold: margins in the hold phase (axes,).
+        limits: required margins by name.
     """
-    figure = Figure(figsize=(8.0, 6.5), layout="constrained")
+    figure = Figure(figsize=(9.5, 6.5), layout="constrained")
     rows = figure.subplots(3, 1, sharex=True)
     panels = (("gain", "dB", "gain_up", "gain_down"), ("phase", "deg", "phase"), ("delay", "s", "delay"))
     for axes, (label, unit, *names) in zip(rows, panels, strict=True):
@@ -86,8 +118,19 @@ def margins_over_time(time_to_go: np.ndarray, judged: np.ndarray, before: Margin
             axes.text(0.5, 0.5, "without a limit", transform=axes.transAxes, ha="center", va="center")
         unstable_times = time_to_go[~before.stable[:, 0]]
         if unstable_times.size:
-            axes.plot(unstable_times, np.zeros_like(unstable_times), "x", color="0.3", label="frozen loop unstable")
-        axes.set(ylabel=f"{label} [{unit}]", ylim=(0.0, None))
+            bottom = np.full_like(unstable_times, 0.03)
+            axes.plot(
+                unstable_times, bottom, "x", color="0.3", label="frozen loop unstable",
+                transform=axes.get_xaxis_transform(),
+            )  # fmt: skip
+        limit = limits.get(f"{label}_margin")
+        if limit is not None:
+            axes.axhline(limit, **LIMIT, label=f"limit {limit:g} {unit}")
+        axes.set(ylabel=f"{label} [{unit}]")
+        if label == "delay" and limited:  # delays span several powers of ten, as they shrink with the time to go
+            logarithmic(axes, "y")
+        else:
+            axes.set_ylim(bottom=0.0)
     if judged.any():
         near, far = rows[0].get_xlim()
         for axes in rows:
@@ -95,7 +138,7 @@ def margins_over_time(time_to_go: np.ndarray, judged: np.ndarray, before: Margin
             axes.axvspan(time_to_go[judged][-1], near, color="0.93", zorder=0)
             axes.set_xlim(far, near)
     for axes in rows:
-        axes.legend(fontsize=9, ncols=2, frameon=True, framealpha=1.0, edgecolor="white")
+        axes.legend(fontsize=9, loc="center left", bbox_to_anchor=(1.0, 0.5))
     rows[-1].set_xlabel("time to go $t_f - t$ [s], until the hand-over")
     plain_ticks(rows[-1].xaxis)
     rows[0].set_title("Margins of the nominal loop with frozen gains, worst axis", loc="left")

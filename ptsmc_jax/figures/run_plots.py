@@ -1,5 +1,7 @@
 """Histories of runs as matplotlib figures with units. Each function returns a Figure."""
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import jax
@@ -8,7 +10,17 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from ptsmc_jax.figures.style import LIMIT, STYLES, error_display, legend_below, new_figure, plain_ticks, with_unit
+from ptsmc_jax.figures.style import (
+    ACTUATOR_LIMIT,
+    LIMIT,
+    STYLES,
+    error_display,
+    legend_below,
+    metric_display,
+    new_figure,
+    plain_ticks,
+    with_unit,
+)
 from ptsmc_jax.plants.base import Chart
 from ptsmc_jax.simulation.rollout import Log, Parts
 from ptsmc_jax.theory import envelopes, solutions
@@ -18,21 +30,31 @@ FAR_OFF = 3.0  # a limit or command beyond this multiple of the curves is only n
 SMALLEST, LARGEST = 1e-16, 1e100  # log axes end at SMALLEST; larger numbers than LARGEST are left out
 EXACT_LINE: Any = {"color": "0.25", "lw": 0.9, "ls": (0, (1, 1.5))}  # style of the line of the exact motion
 BOUND_LINE: Any = {"color": "0.35", "lw": 1.0, "ls": "--", "label": "bound, no noise"}
+NO_LIMITS: Mapping[str, float] = MappingProxyType({})
 
 
-def run_figures(parts: Parts, log: Log, limit: float | None, lower_bound: LowerBound | None) -> dict[str, Figure]:
-    """Return the figures of one run by name; log: numpy arrays (time, component); limit: of the torque [N m]."""
+def run_figures(
+    parts: Parts, log: Log, limits: Mapping[str, float], lower_bound: LowerBound | None
+) -> dict[str, Figure]:
+    """Return the figures of one run by name.
+
+    Args:
+        parts: parts of the run.
+        log: history of the run, NumPy arrays (time, component).
+        limits: required limits by metric, in the unit of the metric.
+        lower_bound: lower bound of the error.
+    """
     log = jax.tree.map(lambda v: np.where(np.abs(v) < LARGEST, v, np.nan), log)
-    figures = {"torque": torque(parts, log, limit)}
+    figures = {"torque": torque(parts, log, limits)}
     if np.any(log.error):  # log axes cannot show zeros
-        figures = {"error": error(parts, log, lower_bound), "sliding": sliding(parts, log), **figures}
+        figures = {"error": error(parts, log, limits, lower_bound), "sliding": sliding(parts, log), **figures}
         if parts.controller.prescribed and any(map(np.any, solutions.exact_sizes(parts, log.t[:1]))):
             figures["convergence"] = convergence(parts, log)
     if np.any(log.d_hat):
         figures["disturbance"] = disturbance(parts, log)
     if log.wheels is not None:
-        figures["wheels"] = wheels(parts, log, 0, "Reaction wheels", "momentum", "N m s")
-        figures["wheel_torque"] = wheels(parts, log, 1, "Torque of the reaction wheels", "torque", "N m")
+        figures["wheels"] = wheels(parts, log, limits, 0, "Momentum of the reaction wheels", "momentum", "N m s")
+        figures["wheel_torque"] = wheels(parts, log, limits, 1, "Torque of the reaction wheels", "torque", "N m")
     return {**{chart.name: state(parts, log, chart) for chart in parts.plant.charts}, **figures}
 
 
@@ -47,8 +69,10 @@ def state(parts: Parts, log: Log, chart: Chart, title: str | None = None) -> Fig
     return figure
 
 
-def error(parts: Parts, log: Log, lower_bound: LowerBound | None = None) -> Figure:
-    """Plot the error's 2-norm on a log scale, with its upper bound, lower bound, and the window of window_error."""
+def error(
+    parts: Parts, log: Log, limits: Mapping[str, float] = NO_LIMITS, lower_bound: LowerBound | None = None
+) -> Figure:
+    """Plot the error's 2-norm on a log scale, with its bounds, its limits and the window of window_error."""
     if parts.controller.kinematics.angle_unit == "rad":
         convert, name, unit = error_display("spacecraft")
         figure, axes = new_figure(name.capitalize(), with_unit(name, unit))
@@ -66,13 +90,30 @@ def error(parts: Parts, log: Log, lower_bound: LowerBound | None = None) -> Figu
         axes.plot(lower_bound.t[known], lower_bound_values[known], color=STYLES[2][0], lw=1.2, label="lower bound")
     t_f = float(parts.controller.t_f)
     axes.axvspan(t_f, t_f + float(parts.window), color="0.85", label="window of window_error")
+    draw_error_limits(axes, parts, limits, float(log.t[-1]))
     _cut_axis(axes)
     _mark_t_f_and_add_legend(figure, parts)
     return figure
 
 
-def torque(parts: Parts, log: Log, limit: float | None = None, title: str | None = None) -> Figure:
-    """Plot the delivered input over time, with its largest value and the limit if there is one."""
+def draw_error_limits(axes: Axes, parts: Parts, limits: Mapping[str, float], t_end: float) -> None:
+    """Draw the required limits of the error, each in the interval in which it applies; `limits`: see `run_figures`."""
+    plant = "spacecraft" if parts.controller.kinematics.angle_unit == "rad" else "chain"
+    t_f = float(parts.controller.t_f)
+    intervals = {"terminal": (t_f, t_f), "window": (t_f, t_f + float(parts.window)), "hold": (t_f, t_end)}
+    if parts.pointing is not None:
+        intervals["ape"] = t_f + float(parts.pointing.after), t_end
+    for metric, limit in limits.items():
+        interval = intervals.get(metric.split("_")[0])
+        if interval is not None:
+            convert, unit = metric_display(metric, plant)
+            shown = float(convert(limit))
+            label = f"limit of {metric} {shown:.4g} {unit}".rstrip()
+            axes.plot(interval, (shown, shown), marker="_", ms=8, **LIMIT, label=label)
+
+
+def torque(parts: Parts, log: Log, limits: Mapping[str, float] = NO_LIMITS, title: str | None = None) -> Figure:
+    """Plot the delivered input over time, with its largest value and its limits."""
     unit = f" {parts.plant.input_unit}".rstrip()
     figure, axes = new_figure(title or "Control", with_unit(parts.plant.input_name, parts.plant.input_unit))
     _plot_components(axes, log.t, log.u, "u", drawstyle="steps-post" if parts.clock.sampled else "default")
@@ -92,20 +133,24 @@ def torque(parts: Parts, log: Log, limit: float | None = None, title: str | None
         axes.plot([], [], color="none", label=f"{label}, beyond this axis")
     else:
         axes.plot(log.t[row], peak, "o", mfc="none", color="black", label=label)
-    if limit is not None:
-        _draw_limit(axes, limit, unit)
+    for metric in ("peak_torque", "peak_torque_delivered"):
+        _draw_limit(axes, limits.get(metric), f"limit of {metric}", unit)
     _mark_t_f_and_add_legend(figure, parts)
     return figure
 
 
-def wheels(parts: Parts, log: Log, index: int, title: str, quantity: str, unit: str) -> Figure:
-    """Plot a quantity of each wheel over time, `log.wheels[index]`, with its limit, a field of `Wheels`."""
+def wheels(
+    parts: Parts, log: Log, limits: Mapping[str, float], index: int, title: str, quantity: str, unit: str
+) -> Figure:
+    """Plot a quantity of each wheel over time, `log.wheels[index]`, with the required limit and that of `Wheels`."""
     assert log.wheels is not None
     figure, axes = new_figure(title, f"{quantity} [{unit}]")
     _plot_components(axes, log.t, log.wheels[index], "hv"[index])
-    limit = getattr(parts.actuators.wheels, f"{quantity}_limit", None)
-    if limit is not None:
-        _draw_limit(axes, float(limit), f" {unit}")
+    metric, wheel_limit = f"peak_wheel_{quantity}", f"{quantity}_limit"
+    _draw_limit(axes, limits.get(metric), f"limit of {metric}", f" {unit}")
+    _draw_limit(
+        axes, getattr(parts.actuators.wheels, wheel_limit, None), f"wheels.{wheel_limit}", f" {unit}", ACTUATOR_LIMIT
+    )
     _mark_t_f_and_add_legend(figure, parts)
     return figure
 
@@ -205,24 +250,31 @@ def _cut_axis(axes: Axes) -> None:
     axes.set_ylim(bottom=SMALLEST if low < SMALLEST < high else low)
 
 
-def _draw_limit(axes: Axes, limit: float, unit: str) -> None:
+def _draw_limit(axes: Axes, limit: float | None, name: str, unit: str, style: Any = LIMIT) -> None:
     """Draw lines at plus and minus a limit; only name it in the legend if it would flatten the curves."""
+    if limit is None:
+        return
+    label = f"{name} {float(limit):.4g}{unit}"
     largest = max((np.nanmax(np.abs(line.get_ydata()), initial=0.0) for line in axes.lines), default=0.0)
     if limit > FAR_OFF * largest > 0.0:
-        axes.plot([], [], color="none", label=f"limit {limit:g}{unit}, beyond this axis")
+        axes.plot([], [], color="none", label=f"{label}, beyond this axis")
         return
     for sign in (-1.0, 1.0):
-        axes.axhline(sign * limit, **LIMIT)
-    axes.plot([], [], **LIMIT, label=f"limit {limit:g}{unit}")
+        axes.axhline(sign * limit, **style)
+    axes.plot([], [], **style, label=label)
 
 
 def _mark_t_f_and_add_legend(figure: Figure, parts: Parts) -> None:
-    """Draw a line at the prescribed time, and add a legend."""
+    """Draw lines at the prescribed time and at an earlier hand-over, and add a legend."""
     (axes,), t_f = figure.axes, float(parts.controller.t_f)
-    axes.axvline(t_f, color="0.3", lw=0.9, ls=":")
-    axes.annotate(
-        f"$t_f$ = {t_f:g} s", (t_f, 1.0), xycoords=("data", "axes fraction"), xytext=(0, 3),
-        textcoords="offset points", ha="center", va="bottom", fontsize=9, color="0.3",
-    )  # fmt: skip
+    times = {t_f: f"$t_f$ = {t_f:g} s"}
+    if parts.controller.prescribed and t_f - float(parts.controller.hand_over) > 0.15 * np.ptp(axes.get_xlim()):
+        times[float(parts.controller.hand_over)] = "hand-over"
+    for time, name in times.items():
+        axes.axvline(time, color="0.3", lw=0.9, ls=":")
+        axes.annotate(
+            name, (time, 1.0), xycoords=("data", "axes fraction"), xytext=(0, 3),
+            textcoords="offset points", ha="center", va="bottom", fontsize=9, color="0.3",
+        )  # fmt: skip
     axes.margins(x=0.01)
     legend_below(figure, columns=3)

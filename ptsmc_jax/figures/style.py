@@ -22,8 +22,10 @@ STYLES = (("#0072B2", "-"), ("#D55E00", "--"), ("#009E73", "-."), ("#000000", ":
 TIME = "time [s]"
 # decorator of functions that draw in the style of ptsmc.mplstyle, which notebooks use too
 styled = matplotlib.style.context("ptsmc_jax.figures.ptsmc")
-LIMIT: Any = {"color": "0.3", "lw": 1.0, "ls": (0, (6, 3))}  # style of the line of a limit
+LIMIT: Any = {"color": "0.3", "lw": 1.0, "ls": (0, (6, 3))}  # style of the line of a required limit
+ACTUATOR_LIMIT: Any = {"color": "0.3", "lw": 1.0, "ls": (0, (6, 2, 1, 2))}  # style of the line of an actuator's limit
 LOWER_BOUND: Any = {"color": "0.3", "lw": 1.0, "ls": ":"}  # style of the line of a lower bound
+LEGEND_WIDTH = 110  # largest width of a legend below the axes, in characters
 WIDE_RATIO = 1e4  # ratio of an axis's ends above which numbers between powers of ten would overlap
 
 
@@ -45,12 +47,22 @@ def new_figure(title: str, ylabel: str) -> tuple[Figure, Axes]:
 
 
 def legend_below(figure: Figure, columns: int) -> None:
-    """Add the legend of the first plot below the axes of a figure, and enlarge the figure for it."""
+    """Add the legend of the first plot below the axes of a figure, and enlarge the figure for it.
+
+    Long labels reduce the number of columns.
+    """
     handles, labels = figure.axes[0].get_legend_handles_labels()
+    while columns > 1 and _legend_width(labels, columns) > LEGEND_WIDTH:
+        columns -= 1
     rows = -(-len(labels) // columns)
     width, height = figure.get_size_inches()
     figure.set_size_inches(width, height + 0.26 * rows)
     figure.legend(handles, labels, loc="outside lower left", ncols=columns, fontsize=9, frameon=False)
+
+
+def _legend_width(labels: Sequence[str], columns: int) -> int:
+    """Return the width of a legend with this number of columns in characters, its lines included."""
+    return sum(8 + max(map(len, column), default=0) for column in np.array_split(labels, columns))
 
 
 def with_unit(name: str, unit: str) -> str:

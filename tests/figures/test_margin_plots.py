@@ -48,6 +48,29 @@ def test_times_that_are_not_judged_are_grey():
         assert axes.get_legend_handles_labels()[1].count("not judged") == 1
 
 
+def test_required_margins_are_drawn():
+    """The gain and phase margins are lines through -1, which the curves must not cross."""
+    limits = {"gain_margin": 6.0, "phase_margin": 30.0, "delay_margin": 0.2, "peak_sensitivity": 5.0}
+    w = np.geomspace(1e-2, 1.0, 50)
+    L = 0.1 / (1j * w)[:, None]
+    nichols, sensitivity = margin_plots.nichols(L, ["x"], limits), margin_plots.sensitivity(w, L, ["x"], limits)
+    times, judged = np.array([10.0, 1.0]), np.full(2, True)
+    over_time = margin_plots.margins_over_time(times, judged, margins(2), margins(1), limits)
+
+    def drawn(axes):
+        return [(line.get_label(), np.asarray(line.get_xydata()).tolist()) for line in axes.lines
+                if line.get_linestyle() == "--" and str(line.get_color()) == "0.3"]  # fmt: skip
+
+    _, gain, phase, (label, _) = drawn(nichols.axes[0])
+    assert gain[1] == [[-180.0, -6.0], [-180.0, 6.0]]
+    assert phase[1] == [[-210.0, 0.0], [-150.0, 0.0]]
+    assert label == "limits of gain_margin 6 dB, phase_margin 30 deg"
+    assert drawn(sensitivity.axes[0]) == [("limit of peak_sensitivity 5 dB", [[0.0, 5.0], [1.0, 5.0]])]
+    labels = [[label for label, _ in drawn(axes)] for axes in over_time.axes]
+    assert labels == [["limit 6 dB"], ["limit 30 deg"], ["limit 0.2 s"]]
+    assert [axes.get_yscale() for axes in over_time.axes] == ["linear", "linear", "log"]
+
+
 def test_a_peak_of_the_sensitivity_is_inside_the_figure():
     """An earlier version cut the figure at 15 dB."""
     w = np.geomspace(1e-2, 1.0, 500)

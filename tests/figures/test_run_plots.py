@@ -60,9 +60,43 @@ def test_the_window_that_a_run_is_judged_in_is_shaded():
 
 def test_the_sliding_variable_has_its_unit_in_both_phases():
     """s is (t_f - t) v' + eta v in the approach phase, and v' + c v in the hold phase."""
-    figures = ptsmc_jax.simulate(from_tables(untuned(SHORT))).plot("sliding", "convergence")
+    early = ptsmc_jax.replace(from_tables(untuned(SHORT)), controller__delta=1.5)
+    figures = ptsmc_jax.simulate(early).plot("sliding", "convergence")
+    assert [text.get_text() for text in figures["sliding"].axes[0].texts] == ["$t_f$ = 5 s", "hand-over"]
     assert figures["sliding"].axes[0].get_ylabel() == "|s| [-], after the hand-over [1/s]"
     assert figures["convergence"].axes[0].get_ylabel().endswith("and |s| [-]")
+
+
+def test_required_limits_are_drawn_in_the_intervals_in_which_they_apply():
+    required = {"peak_torque": 3.0, "terminal_angle": 0.01, "window_error": 1e-3, "ape_x": 1e-4, "effort": 50.0}
+    tables = untuned(SHORT) | {"requirements": required, "pointing": {"boresight": [0, 0, 1], "after": 0.5}}
+    figures = ptsmc_jax.simulate(from_tables(tables)).plot("error", "torque")
+    lines = {str(line.get_label()): np.asarray(line.get_xydata()) for line in figures["error"].axes[0].lines}
+    limits = {label: line for label, line in lines.items() if label.startswith("limit")}
+    arcsec = 180.0 * 3600.0 / np.pi
+    for (label, line), name, interval, limit in zip(
+        limits.items(),
+        ("terminal_angle", "window_error", "ape_x"),
+        ([5.0, 5.0], [5.0, 6.0], [5.5, 6.5]),
+        (0.01, 2.0 * np.arcsin(1e-3), 1e-4),
+        strict=True,
+    ):
+        assert label == f"limit of {name} {arcsec * limit:.4g} arcsec"
+        np.testing.assert_allclose(line, np.transpose([interval, [arcsec * limit] * 2]))
+    labels = figures["torque"].axes[0].get_legend_handles_labels()[1]
+    assert [label for label in labels if label.startswith("limit")] == ["limit of peak_torque 3 N m"]
+
+
+def test_wheels_show_the_required_limit_and_their_own():
+    wheels = {"kind": "pyramid", "torque_limit": 2.0, "momentum_limit": 500.0}
+    tables = untuned(SHORT) | {"wheels": wheels, "requirements": {"peak_wheel_torque": 1.5}}
+    figures = ptsmc_jax.simulate(from_tables(tables)).plot("wheels", "wheel_torque")
+    for figure in figures.values():
+        figure.draw_without_rendering()
+        assert figure.legends[0].get_window_extent().x1 <= figure.bbox.x1
+    drawn = {name: figure.axes[0].get_legend_handles_labels()[1][4:] for name, figure in figures.items()}
+    assert drawn["wheel_torque"] == ["limit of peak_wheel_torque 1.5 N m", "wheels.torque_limit 2 N m"]
+    assert drawn["wheels"] == ["wheels.momentum_limit 500 N m s, beyond this axis"]
 
 
 @pytest.mark.parametrize(("disturbance", "drawn"), [("none", set()), ("sinusoid", {"error", "sliding"})])

@@ -116,10 +116,10 @@ def test_a_profile_with_few_values_shows_the_whole_interval_of_its_gain(known):
 def test_a_limit_far_above_the_curves_is_labelled_and_does_not_flatten_them(limit, drawn):
     _, axes = new_figure("torque", "u")
     axes.plot([0.0, 1.0], [-1.0, 0.5])
-    run_plots._draw_limit(axes, limit, " N m")
+    run_plots._draw_limit(axes, limit, "limit of peak_torque", " N m")
     assert (max(axes.get_ylim()) > 2.0) == drawn
     (said,) = [line.get_label() for line in axes.lines if str(line.get_label()).startswith("limit")]
-    assert said == f"limit {limit:g} N m" + ("" if drawn else ", beyond this axis")
+    assert said == f"limit of peak_torque {limit:g} N m" + ("" if drawn else ", beyond this axis")
 
 
 def test_cells_of_a_map_meet_half_way_between_grid_points():

@@ -1,6 +1,6 @@
 """Figures of a Monte Carlo campaign, made from its rows. Read `build` first."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -44,7 +44,7 @@ def build(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
     figures: dict[str, Figure] = {}
     if finished.any():
         if folder.can_simulate:  # campaigns store no histories, so the figure simulates its trials again
-            figures |= _plot_fan(folder, frame, finished)
+            figures |= _plot_fan(folder, frame, finished, limits)
         figures["distributions"] = plots.distributions(
             {name: plotted_column(name, np.where(finished, frame[name].to_numpy(), np.nan)) for name in names}
         )
@@ -109,7 +109,9 @@ def _describe_time_fraction(verdict: Verdict) -> str:
     return f"{required}; seen: {qualifier}{percent(verdict.fraction_of_time)} %"
 
 
-def _plot_fan(folder: Folder, frame: pl.DataFrame, finished: np.ndarray) -> dict[str, Figure]:
+def _plot_fan(
+    folder: Folder, frame: pl.DataFrame, finished: np.ndarray, limits: Mapping[str, float]
+) -> dict[str, Figure]:
     """Simulate the first trials and the trial with the largest window error again, and plot their errors over time.
 
     The result is empty if none of the first trials reaches its end, or if all errors are zero: the axis is logarithmic.
@@ -120,5 +122,5 @@ def _plot_fan(folder: Folder, frame: pl.DataFrame, finished: np.ndarray) -> dict
     simulated = np.append(first_trials, trials[worst_row]).astype(np.uint32)
     t, error = running.error_history(folder.campaign_without_metrics, simulated)
     worst, finished_errors = (int(trials[worst_row]), error[-1]), error[:-1][finished[: first_trials.size]]
-    t_f, plant = folder.scenario.controller.t_f, folder.scenario.plant.kind
-    return {"fan": plots.fan(t, finished_errors, worst, t_f, plant)} if finished_errors.any() else {}
+    parts = folder.campaign_without_metrics.ready.parts
+    return {"fan": plots.fan(t, finished_errors, worst, parts, limits)} if finished_errors.any() else {}

@@ -91,4 +91,4 @@ def write(
     if figures:
         from ptsmc_jax.figures import run_plots, style  # the import takes 0.3 s, which only figures need
 
-        style.save(run_plots.run_figures(run.parts, run.log, run.torque_limit, run.lower_bound), folder / "figures")
+        style.save(run_plots.run_figures(run.parts, run.log, run.limits, run.lower_bound), folder / "figures")

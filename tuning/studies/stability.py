@@ -198,10 +198,15 @@ def figures_of(ready: Study, course: Course) -> dict[str, "Figure"]:
     inputs, _ = signal_names(ready)
     loop, hold = course.hold
     w, responses = margins.responses(loop)
+    limits = {requirement.metric: requirement.limit for requirement in ready.margins}
     return {
-        "nichols": margin_plots.nichols(responses, inputs),
-        "sensitivity": margin_plots.sensitivity(w, responses, inputs),
+        "nichols": margin_plots.nichols(responses, inputs, limits),
+        "sensitivity": margin_plots.sensitivity(w, responses, inputs, limits),
         "margins": margin_plots.margins_over_time(
-            float(ready.parts.controller.t_f) - course.t[:-1], course.judged[:-1], course.before_hand_over, hold
+            float(ready.parts.controller.t_f) - course.t[:-1],
+            course.judged[:-1],
+            course.before_hand_over,
+            hold,
+            limits,
         ),
     }
