@@ -1,7 +1,7 @@
 """Figures of an identification: measured and predicted signals, innovations, their autocorrelation, estimates."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -15,6 +15,8 @@ from ptsmc_jax.identification.estimation import Fit, Identification
 if TYPE_CHECKING:
     from polars import DataFrame
 
+Panel = tuple[str, np.ndarray, np.ndarray, np.ndarray]  # label, measured, predicted and rejected, see `signals`
+REJECTED: Any = {"marker": "x", "ms": 4, "color": "0.3", "mew": 0.8, "ls": ""}  # style of rejected readings
 POINTS = 4000  # largest number of points of a line
 UNITS = {"attitude": ("arcsec", ARCSEC), "rate": ("rad/s", 1.0)}  # drawn units of innovations, and their factors
 
@@ -35,25 +37,27 @@ def identification_figures(identification: Identification) -> dict[str, Figure]:
     return figures
 
 
-def _predictions(fit: Fit, values: np.ndarray) -> list[tuple[str, np.ndarray, np.ndarray]]:
-    """Return label, measured and predicted values of each signal; the attitude is the rotation from the first row."""
+def _predictions(fit: Fit, values: np.ndarray) -> list[Panel]:
+    """Return the panel of each signal; the attitude is the rotation from the first row."""
     panels, first_column = [], 0
+    is_rejected = (fit.rows.valid[1:] & ~fit.innovations.accepted)[fit.rows.log_row[1:] >= 0]
     for name, readings in fit.log.readings.items():
         measured = readings[1:]
         size = 3 if name == "attitude" else readings.shape[1]
-        errors = values[:, first_column : first_column + size]
+        columns = slice(first_column, first_column + size)
+        errors, rejected = values[:, columns], is_rejected[:, columns]
         first_column += size
         if name == "attitude":
-            has_reading = ~np.isnan(measured[:, 0]) & ~np.isnan(errors[:, 0])
+            has_reading = ~np.isnan(measured[:, 0])
             angles, predicted = np.full((len(measured), 3), np.nan), np.full((len(measured), 3), np.nan)
             first_attitude, attitudes = Rotation.from_quat(readings[0]), Rotation.from_quat(measured[has_reading])
             angles[has_reading] = np.rad2deg((first_attitude.inv() * attitudes).as_rotvec())
-            predicted_attitudes = attitudes * Rotation.from_rotvec(-errors[has_reading])
+            predicted_attitudes = attitudes * Rotation.from_rotvec(-np.nan_to_num(errors[has_reading]))
             predicted[has_reading] = np.rad2deg((first_attitude.inv() * predicted_attitudes).as_rotvec())
-            panels.append(("rotation [deg]", angles, predicted))
+            panels.append(("rotation [deg]", angles, np.where(np.isnan(errors), np.nan, predicted), rejected))
         else:
             label = "rate [rad/s]" if name == "rate" else "state"
-            panels.append((label, measured, measured - errors))
+            panels.append((label, measured, measured - errors, rejected))
     return panels
 
 
@@ -74,20 +78,28 @@ def _select_rows(count: int) -> np.ndarray:
 
 
 @style.styled
-def signals(t: np.ndarray, panels: list[tuple[str, np.ndarray, np.ndarray]]) -> Figure:
-    """Draw measured and predicted signals over time.
+def signals(t: np.ndarray, panels: list[Panel]) -> Figure:
+    """Draw measured and predicted signals over time; crosses at the edge are rejected readings beyond it.
 
     Args:
         t: times (rows,) [s].
-        panels: label, measured and predicted values (rows, components) of each signal.
+        panels: of each signal the label, the measured and the predicted values (rows, components), and whether the
+            filter rejected each value as an outlier.
     """
     figure, axes = _panels([label for label, *_ in panels], "Measured (dots) and predicted (lines)")
     drawn = _select_rows(len(t))
-    for panel, (_, measured, predicted) in zip(axes, panels, strict=True):
+    for panel, (_, measured, predicted, rejected) in zip(axes, panels, strict=True):
         for k in range(measured.shape[1]):
             colour, _ = style.STYLES[k % len(style.STYLES)]
-            panel.plot(t[drawn], measured[drawn, k], ".", ms=2, color=colour, alpha=0.4)
+            accepted = np.where(rejected[:, k], np.nan, measured[:, k])
+            panel.plot(t[drawn], accepted[drawn], ".", ms=2, color=colour, alpha=0.4)
             panel.plot(t[drawn], predicted[drawn, k], "-", lw=0.9, color=colour, label=f"component {k + 1}")
+        low, high = panel.get_ylim()
+        row, column = np.nonzero(rejected)
+        panel.plot(t[row], np.clip(measured[row, column], low, high), clip_on=False, **REJECTED)
+        panel.set_ylim(low, high)
+    if any(np.any(rejected) for *_, rejected in panels):
+        axes[0].plot([], [], **REJECTED, label="rejected")
     style.legend_below(figure, columns=6)
     return figure
 

@@ -8,11 +8,25 @@ from ptsmc_jax.figures import identification_plots
 def test_signals_show_every_component_and_a_legend_below_them():
     """An earlier version drew five components, and its legend covered the title."""
     t, values = np.arange(5.0), np.ones((5, 7))
-    figure = identification_plots.signals(t, [("state", values, values)])
+    figure = identification_plots.signals(t, [("state", values, values, values > 1.0)])
     figure.draw_without_rendering()
     (axes,), (legend,) = figure.axes, figure.legends
     assert len(legend.get_texts()) == 7
     assert legend.get_window_extent().y1 < axes.get_window_extent().y0
+
+
+def test_rejected_readings_are_crosses():
+    """A reading far beyond the others is drawn at the edge, and its predicted value is missing."""
+    t, measured = np.arange(6.0), np.stack([np.arange(6.0), np.zeros(6)], axis=1)
+    measured[3, 0] = 1e6
+    rejected = measured > 10.0
+    predicted = np.where(rejected, np.nan, measured)
+    figure = identification_plots.signals(t, [("rate [rad/s]", measured, predicted, rejected)])
+    (axes,) = figure.axes
+    crosses = [np.asarray(line.get_xydata()) for line in axes.lines if line.get_marker() == "x"]
+    np.testing.assert_allclose(crosses[0], [[3.0, max(axes.get_ylim())]])
+    assert max(axes.get_ylim()) < 10.0
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["component 1", "component 2", "rejected"]
 
 
 def test_a_proposed_manoeuvre_names_its_components():
