@@ -22,12 +22,14 @@ from ptsmc_jax.figures.style import (
     error_display,
     legend_below,
     logarithmic,
+    metric_display,
     new_figure,
     plain_ticks,
     styled,
+    torque_metric,
 )
 from ptsmc_jax.scenario.gain_bounds import is_log_scaled
-from ptsmc_jax.simulation.catalogues import CATALOGUES
+from ptsmc_jax.simulation.catalogues import CATALOGUES, without_norms
 
 MARKERS = ("o", "^", "s", "D", "v")
 BEYOND = ("x", "+", "1", "2", "3", "4")  # markers of points that violate a limit, one for each limit
@@ -124,9 +126,14 @@ def tuning_history(
 
 @styled
 def tornado(sensitivities: Mapping[str, Mapping[str, float]]) -> Figure:
-    """Plot the sensitivity of each metric to each gain [% per %], the largest on top; metric -> gain -> sensitivity."""
+    """Plot the sensitivity of each metric to each gain [% per %], the largest on top; metric -> gain -> sensitivity.
+
+    A norm of an error is left out if its angle is there too.
+    """
+    sensitivities = {metric: sensitivities[metric] for metric in without_norms(sensitivities)}
     rows = sum(len(by_gain) + 1 for by_gain in sensitivities.values())
     figure = Figure(figsize=(8.0, 1.0 + 0.3 * rows), layout="constrained")
+    figure.suptitle("Sensitivity of the metrics to the gains")
     axes = figure.subplots(len(sensitivities), 1, sharex=True, squeeze=False)[:, 0]
     for ax, (metric, by_gain) in zip(axes, sensitivities.items(), strict=True):
         order = sorted(by_gain, key=lambda gain: abs(by_gain[gain]))
@@ -177,20 +184,22 @@ def profiles(gains: Mapping[str, Profile], goal: str) -> Figure:
 
 def tradeoff(
     sets: Mapping[str, tuple[ArrayLike, ArrayLike]],
-    limit: float | None,
+    limits: Mapping[str, float],
     kind: str = "spacecraft",
     lower_bound: float | None = None,
 ) -> Figure:
     """Plot accuracy against torque, a point a trial.
 
     Args:
-        sets: window errors (trials,) [-] and peak torques (trials,) [N m] by label.
-        limit: limit of the torque.
+        sets: window errors (trials,) [-] and torques (trials,) [N m] by label; the torque is `torque_metric(limits)`.
+        limits: required limits by metric, in the unit of the metric.
         kind: kind of the plant, which determines the units.
         lower_bound: lower bound of the RMS error.
     """
-    (convert, name, error_unit), unit = error_display(kind), CATALOGUES[kind]["peak_torque"].unit
-    figure, axes = new_figure("Accuracy against torque, held-out trials", f"peak torque [{unit}]")
+    torque = torque_metric(limits)
+    (convert, name, error_unit), unit = error_display(kind), CATALOGUES[kind][torque].unit
+    label = f"{torque.replace('_', ' ')} [{unit}]"
+    figure, axes = new_figure("Accuracy against torque, held-out trials", label)
     arrays = {label: (np.asarray(e), np.asarray(u)) for label, (e, u) in sets.items()}
     looks = zip(arrays.items(), _colours_and_markers(len(arrays)), range(len(arrays), 0, -1), strict=True)
     for (label, (errors, torques)), (colour, marker), above in looks:  # the first set is drawn above the others
@@ -198,8 +207,11 @@ def tradeoff(
         axes.loglog(convert(errors), torques, marker, ms=2.5, alpha=0.35, color=colour, mew=0, zorder=2)
         text = f"{label.replace('_', ' ')}: RMS {float(f'{rms:.3g}'):g} {error_unit}, mean peak {mean:.3g} {unit}"
         axes.loglog(rms, mean, marker, ms=9, color=colour, mec="white", label=text, zorder=2 + above)
-    if limit is not None:
-        axes.axhline(limit, **LIMIT, label=f"limit {limit:g} {unit}")
+    if torque in limits:
+        axes.axhline(limits[torque], **LIMIT, label=f"limit of {torque} {limits[torque]:g} {unit}")
+    for metric in limits.keys() & {"window_error", "window_angle"}:
+        limit = float(metric_display(metric, kind)[0](limits[metric]))
+        axes.axvline(limit, **LIMIT, label=f"limit of {metric} {limit:.4g} {error_unit}")
     if lower_bound:
         least = float(convert(lower_bound))
         axes.axvline(least, **LOWER_BOUND, label=f"lower bound {least:.3g} {error_unit}")

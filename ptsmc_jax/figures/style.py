@@ -1,7 +1,7 @@
 """The common style of all figures, and their files."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,6 +25,7 @@ styled = matplotlib.style.context("ptsmc_jax.figures.ptsmc")
 LIMIT: Any = {"color": "0.3", "lw": 1.0, "ls": (0, (6, 3))}  # style of the line of a required limit
 ACTUATOR_LIMIT: Any = {"color": "0.3", "lw": 1.0, "ls": (0, (6, 2, 1, 2))}  # style of the line of an actuator's limit
 LOWER_BOUND: Any = {"color": "0.3", "lw": 1.0, "ls": ":"}  # style of the line of a lower bound
+TORQUES = ("peak_torque", "peak_torque_delivered", "peak_wheel_torque")
 LEGEND_WIDTH = 110  # largest width of a legend below the axes, in characters
 WIDE_RATIO = 1e4  # ratio of an axis's ends above which numbers between powers of ten would overlap
 
@@ -101,6 +102,11 @@ def metric_display(metric: str, plant: str) -> tuple[Callable[[ArrayLike], np.nd
     if unit == "rad":
         return lambda values: ARCSEC * np.asarray(as_angle(metric, stated_unit, values)[1]), "arcsec"
     return np.asarray, unit
+
+
+def torque_metric(limits: Container[str]) -> str:
+    """Return the torque metric that figures of many trials show: the first required one, or the commanded torque."""
+    return next((name for name in TORQUES if name in limits), TORQUES[0])
 
 
 def objective_display(name: str, minimised: str, plant: str) -> tuple[Callable[[ArrayLike], np.ndarray], str]:

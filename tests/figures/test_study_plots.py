@@ -41,21 +41,34 @@ def test_the_search_is_coloured_where_the_requirements_are_met():
 def test_a_tradeoff_figure_has_each_trial_and_their_rms():
     """Errors of 3e-6, 4e-6 and 12e-6 have an RMS of 13e-6 / sqrt(3), and small angles are twice as large."""
     errors, peaks = np.array([3e-6, 4e-6, 12e-6]), np.array([0.2, 0.4, 0.3])
-    figure = study_plots.tradeoff({"tuned": (errors, peaks)}, limit=0.5, lower_bound=1e-6)
+    figure = study_plots.tradeoff(
+        {"tuned": (errors, peaks)}, {"peak_wheel_torque": 0.5, "window_error": 1e-5}, lower_bound=1e-6
+    )
     (axes,) = figure.axes
     trials, (whole,) = (np.asarray(line.get_xydata()) for line in axes.lines[:2])
     arcsec = 2.0 * np.degrees(1.0) * 3600.0
     np.testing.assert_allclose(trials, np.stack([arcsec * errors, peaks], axis=1), rtol=1e-10)
     np.testing.assert_allclose(whole, [arcsec * 13e-6 / np.sqrt(3.0), 0.3], rtol=1e-10)
     said = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
-    assert said == ["tuned: RMS 3.1 arcsec, mean peak 0.3 N m", "limit 0.5 N m", "lower bound 0.413 arcsec"]
+    assert said == [
+        "tuned: RMS 3.1 arcsec, mean peak 0.3 N m",
+        "limit of peak_wheel_torque 0.5 N m",
+        "limit of window_error 4.125 arcsec",
+        "lower bound 0.413 arcsec",
+    ]
+    assert axes.get_ylabel() == "peak wheel torque [N m]"
 
 
 def test_the_first_set_of_a_tradeoff_figure_is_not_hidden_by_a_later_one_at_the_same_place():
     same = np.array([3e-6, 4e-6]), np.array([0.2, 0.4])
-    (axes,) = study_plots.tradeoff({"tuned": same, "before": same}, limit=None).axes
+    (axes,) = study_plots.tradeoff({"tuned": same, "before": same}, {}).axes
     tuned, before = (line for line in axes.lines if ": RMS" in str(line.get_label()))
     assert tuned.get_zorder() > before.get_zorder()
+
+
+def test_sensitivities_of_an_error_and_its_angle_are_drawn_once():
+    figure = study_plots.tornado({name: {"eta": -1.0} for name in ("window_error", "peak_torque", "window_angle")})
+    assert [axes.get_title(loc="left") for axes in figure.axes] == ["peak_torque", "window_angle"]
 
 
 @pytest.mark.parametrize(("low", "high", "least"), [(1e-6, 0.1, 5), (4.167e-5, 0.1188, 4)])  # second: long numbers

@@ -11,12 +11,12 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import campaign as running
 from ptsmc_jax.campaigns import rows
 from ptsmc_jax.figures import campaign_plots as plots
+from ptsmc_jax.figures.style import torque_metric
 from ptsmc_jax.numerics import statistics
 from ptsmc_jax.simulation.catalogues import as_angle, percent, without_norms
 from ptsmc_jax.simulation.requirements import INTERPRETATIONS, Requirement, Verdict
 from tuning.studies.campaign_folder import Folder
 
-TORQUES = ("peak_torque", "peak_torque_delivered", "peak_wheel_torque")  # the first required one is plotted
 FAN_TRIALS = 1000  # largest number of trials whose histories are plotted
 SCATTER_TRIALS = 5000  # largest number of trials in a scatter plot
 
@@ -26,7 +26,7 @@ def build(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
     parts = folder.intact_parts()
     required = scenario.requirements(folder.scenario)
     limits = {r.metric: r.limit for r in required}
-    torque_name = next((name for name in TORQUES if name in limits), TORQUES[0])
+    torque_name = torque_metric(limits)
     metrics = dict.fromkeys((*limits, "window_error", torque_name))
     names = without_norms(metrics)
     time_metrics = [r.timed for r in required if r.timed is not None]

@@ -20,7 +20,7 @@ from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.figures import study_plots, style
 from ptsmc_jax.numerics.statistics import has_variation, sample_quantile
-from ptsmc_jax.scenario import custom, free_gains, parsing, plausibility, replace, study, systems, tables
+from ptsmc_jax.scenario import custom, free_gains, parsing, plausibility, replace, requirements, study, systems, tables
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.law_tables import LAWS, common_keys
 from ptsmc_jax.scenario.spacecraft_scenario import SpacecraftScenario
@@ -420,10 +420,11 @@ def _plot_figures(comparison: Comparison) -> Iterator[tuple[str, Figure]]:
         {law: (np.degrees(t.drawn["initial_angle"]), np.where(t.finished, t.metrics.settling_time, np.nan))
          for law, t in trials_by_law.items()}, t_f,
     )  # fmt: skip
-    limit = tables.limit_of(ours.simulated, "peak_torque")
+    limits = {requirement.metric: requirement.limit for requirement in requirements(ours.simulated)}
+    torque = style.torque_metric(limits)
     yield "tradeoff", study_plots.tradeoff(
-        {law: (t.metrics.window_error[t.finished], t.metrics.peak_torque[t.finished])
-         for law, t in trials_by_law.items() if t.finished.any()}, limit,
+        {law: (t.metrics.window_error[t.finished], getattr(t.metrics, torque)[t.finished])
+         for law, t in trials_by_law.items() if t.finished.any()}, limits,
     )  # fmt: skip
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.montecarlo import Trials
-from ptsmc_jax.scenario import custom, free_gains, parsing, plausibility, tables
+from ptsmc_jax.scenario import custom, free_gains, parsing, plausibility, requirements
 from ptsmc_jax.scenario.tables import LIMITS, T_F, Scenario, objective_name
 from ptsmc_jax.simulation import catalogues
 from tuning.search import custom_parts, trust
@@ -269,16 +269,17 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, "Figure"]:
             (float(to_unit(tuning.search.value)), dict(zip(names, map(float, tuning.search.gains), strict=True))),
         ),
     }
+    limits = {requirement.metric: requirement.limit for requirement in requirements(scenario)}
+    torque = style.torque_metric(limits)
     finished_results = {
         gain_names.published_label(scenario) if name == "published" else name: (
-            trials.metrics.window_error[trials.finished], trials.metrics.peak_torque[trials.finished]
+            trials.metrics.window_error[trials.finished], getattr(trials.metrics, torque)[trials.finished]
         )
         for name, trials in tuning.held_out.items()
         if trials.finished.any()
     }  # fmt: skip
     if finished_results:
-        limit, lower_bound = tables.limit_of(scenario, "peak_torque"), tuning.lower_bounds["tuned"]
-        figures["tradeoff"] = study_plots.tradeoff(finished_results, limit, kind, lower_bound)
+        figures["tradeoff"] = study_plots.tradeoff(finished_results, limits, kind, tuning.lower_bounds["tuned"])
     if tuning.trust is not None and tuning.trust.sensitivities:  # the table is empty if no trial reaches its end
         figures["sensitivities"] = study_plots.tornado(tuning.trust.sensitivities)
     if tuning.trust is not None:
