@@ -58,6 +58,13 @@ class Track(NamedTuple):
         """Return the estimated body rate (3,) [rad/s]."""
         return self.rate - self.bias
 
+    @property
+    def by_name(self) -> dict[str, Array]:
+        """Return the state by the names of the fields in exported C."""
+        named = {"attitude": self.q, "bias": self.bias, "gyro": self.rate, "past_attitude": self.past_q,
+                 "past_rate": self.past_w, "covariance": self.covariance}  # fmt: skip
+        return {name: value for name, value in named.items() if value is not None}
+
 
 @pytree
 @dataclass(frozen=True)

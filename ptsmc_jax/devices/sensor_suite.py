@@ -129,10 +129,7 @@ class SensorSuite(SpacecraftSensors):
 
     def filter_state(self, memory: SuiteMemory) -> dict[str, Array]:
         """Return the state of the Kalman filter by the names of the fields in exported C."""
-        track = memory.estimate
-        named = {"attitude": track.q, "bias": track.bias, "gyro": track.rate, "covariance": track.covariance}
-        past = {"past_attitude": track.past_q, "past_rate": track.past_w}
-        return named | {name: value for name, value in past.items() if value is not None}
+        return memory.estimate.by_name
 
     def measure(
         self, memory: SuiteMemory, x: AttitudeState, now: Ticks, dt: Scalar, star_x: PyTree = None

@@ -279,11 +279,8 @@ def _add_kalman_filter_stage(computer: Board, estimator: KalmanFilter) -> None:
         if sensor.times.every is None:
             computer.inputs[f"{name}_age"] = real()
             computer.meanings[f"{name}_age"] = f"age of the reading of {name} at the sample [s]"
-    past_count, state_size = estimator.past_samples, 9 + 3 * estimator.past_samples
-    computer.state |= {"attitude": real(4), "rate": real(3), "bias": real(3), "gyro": real(3)}
-    computer.state |= {"past_attitude": real(past_count, 4)} if past_count else {}
-    computer.state |= {"past_rate": real(past_count, 3)} if estimator.has_readings_between_samples else {}
-    computer.state["covariance"] = real(state_size, state_size)
+    track = jax.eval_shape(estimator.begin, real(4), real(3), real(3), real(6), 0, real())
+    computer.state |= {"attitude": real(4), "rate": real(3)} | track.by_name
     computer.meanings |= {
         "bias": "estimated gyro bias [rad/s]",
         "gyro": "rate that the gyro measured at the last sample, minus its estimated noise [rad/s]",
@@ -319,16 +316,8 @@ def _add_kalman_filter_stage(computer: Board, estimator: KalmanFilter) -> None:
             corrected = partial(estimator.correct, track, k, reading, age, one)
             track = jax.lax.cond(valid, corrected, lambda track=track: track)
         x = _nearest_form(parameters, values, AttitudeState(track.q, track.w), AttitudeState(start, track.w))
-        now = {
-            "attitude": x.q,
-            "rate": track.w,
-            "bias": track.bias,
-            "gyro": track.rate,
-            "past_attitude": track.past_q,
-            "past_rate": track.past_w,
-            "covariance": track.covariance,
-        }
-        return {f"now.{name}": value for name, value in now.items() if value is not None}
+        now = track._replace(q=x.q).by_name | {"rate": track.w}
+        return {f"now.{name}": value for name, value in now.items()}
 
     summary = "Attitude Kalman filter: propagates the attitude with the gyro and corrects it with the attitude sensors."
     computer.stages.append(Stage("sense", summary, sense, (estimator,)))
