@@ -202,9 +202,8 @@ def check_envelopes(n, case):
     centre, half = (np.asarray(v) for v in found)
     largest = 1e-7 * np.abs(log.x).max(axis=0) + 1e-12
     assert np.all(np.abs(log.x[: t.size] - centre) <= half * (1 + 1e-6) + largest)
-    t = log.t[t.size :]
-    assert np.all(np.abs(log.s[-t.size :, 0]) <= hold_phase.sliding_bound(run, t) * (1 + 1e-6) + rounding)
-    assert np.all(np.abs(log.x[-t.size :, 0]) <= hold_phase.error_bound(run, t) * (1 + 1e-6) + largest[0])
+    later = jax.tree.map(lambda v: v[t.size :], log)
+    assert np.all(np.abs(later.s[:, 0]) <= hold_phase.sliding_bound(run, later) * (1 + 1e-6) + rounding)
 
 
 test_chain_of_order_3_is_inside_its_envelopes = drawn(check_envelopes, 15, n=st.just(3), case=SCENARIO)

@@ -76,20 +76,6 @@ def test_runs_follow_the_closed_form_in_the_hold_phase(law, c, k):
         np.testing.assert_allclose(result.log.u[after], acceleration, rtol=0, atol=1e-9)  # gains of up to 20
 
 
-@pytest.mark.parametrize(("c", "k"), [*RATES, (1.0, 1.0 + 1e-9)])
-def test_order_two_equals_the_explicit_formula(c, k):
-    t, x, x_dot = np.array([0.0, 0.3, 2.0, 30.0]), 0.7, -1.9
-    s = x_dot + c * x
-    between = t * np.exp(-c * t) if abs(c - k) < 1e-6 else (np.exp(-k * t) - np.exp(-c * t)) / (c - k)
-    for time, expected in zip(t, np.exp(-c * t) * x + s * between, strict=True):
-        found = hold_phase.exact_hold(vector(time), vector([c]), vector(k), vector([x, x_dot]))
-        np.testing.assert_allclose(found.x[0], expected, rtol=1e-7 if 0 < abs(c - k) < 1e-6 else 1e-12, atol=1e-14)
-        np.testing.assert_allclose(found.s, s * np.exp(-k * time), rtol=1e-12, atol=1e-14)
-        np.testing.assert_allclose(
-            found.acceleration, -(c + k) * found.x[1] - c * k * found.x[0], rtol=1e-12, atol=1e-15
-        )
-
-
 def test_surface_rate_scales_the_surface_poles_of_a_chain():
     a = [2.0, 3.0, 1.7]
     law = chain_parts([1.0] * 4, a=a, surface_rate=2.5).controller
@@ -121,26 +107,3 @@ def test_gradient_by_the_surface_rate_equals_the_closed_form():
         two_back, back, ahead, two_ahead = (float(with_gradients(run, at + step * h)[0]) for step in (-2, -1, 1, 2))
         difference = (two_back - 8 * back + 8 * ahead - two_ahead) / (12 * h)
         np.testing.assert_allclose(forward, difference, rtol=1e-8)  # errors of order h^4 and 1e-15 / h
-
-
-def test_hold_envelopes_are_within_a_factor_of_ten():
-    """Without a disturbance the envelopes decay like the run. They are larger, because they ignore the sign of s."""
-    run = simulated(2, 2.5, 0.7)
-    log = fly(run).log
-    t = log.t[log.t >= 8.0]
-    for size, bound in (
-        (np.abs(log.s[-t.size :, 0]), hold_phase.sliding_bound(run, t)),
-        (np.abs(log.x[-t.size :, 0]), hold_phase.error_bound(run, t)),
-    ):
-        ratio = size / bound
-        assert 0.1 < ratio[-1] <= ratio.max() <= 1.0
-
-
-def test_squared_envelope_of_s_decays_to_the_residual_of_the_smooth_sign():
-    """The limit is 0.2785 K width / k. Half of the way is reached after ln 2 / (2 k)."""
-    bound, width, k = 0.02, 0.1, 0.7
-    run = chain_parts([1.0, -0.5], 10.0, 3.0, 2.0, k1=k, bound=bound, sign_width=width)
-    first, half, last = hold_phase.sliding_bound(run, 8.0 + np.array([0.0, np.log(2.0) / (2.0 * k), 1e3])) ** 2
-    assert first > 2.0 * last
-    np.testing.assert_allclose(last, 0.2785 * bound * width / k, rtol=1e-9)
-    np.testing.assert_allclose(half, (first + last) / 2.0, rtol=1e-9)
