@@ -23,6 +23,7 @@ from ptsmc_jax.theory.margins import Margins
 # shortest time to go at which margins are computed, in periods; gains then change by a tenth in a period
 SHORTEST = 10
 TIMES = 4  # number of times to go at which margins are computed
+FURTHER_TIMES = 24  # number of further times to go of `margins_along_run`
 LONGEST = 0.25  # longest time to go at which margins are computed, as a fraction of t_f
 
 
@@ -170,14 +171,14 @@ def judge_run(parts: Parts, *, with_delay: bool = True) -> tuple[Margins, np.nda
     return limit_cycles.zero_margins(values, hold & (limit_cycle is not None)), hold, limit_cycle
 
 
-def margins_along_run(parts: Parts, times: int = 24) -> Course:
+def margins_along_run(parts: Parts) -> Course:
     """Return the margins of sampled parts along their nominal run.
 
-    The times are the judged ones, one in the hold phase, and about `times` further ones. If there is a limit cycle, the
-    margins in the hold phase are zero, see `limit_cycles`.
+    The times are the judged ones, one in the hold phase, and about `FURTHER_TIMES` further ones. If there is a limit
+    cycle, the margins in the hold phase are zero, see `limit_cycles`.
     """
     run = linear.simulate_nominal_jit(parts)
-    times_to_go, commands, singularity_distance, not_converged = _run_data(parts, run, times)
+    times_to_go, commands, singularity_distance, not_converged = _run_data(parts, run)
     at_times = margins_at(parts, times_to_go, run)
     index_at = {t: k for k, t in reversed(list(enumerate(at_times.t.tolist()))) if not at_times.hold[k]}
     order = np.asarray([k for _, k in sorted(index_at.items())] + [len(at_times.t) - 1])
@@ -205,16 +206,15 @@ def margins_along_run(parts: Parts, times: int = 24) -> Course:
     )
 
 
-@programs.jit(static_argnames="times", compiler_options=programs.FAST_COMPILE)
-def _run_data(parts: Parts, run: linear.NominalRun, times: int) -> tuple[Array, History, Scalar, Array]:
+@programs.jit(compiler_options=programs.FAST_COMPILE)
+def _run_data(parts: Parts, run: linear.NominalRun) -> tuple[Array, History, Scalar, Array]:
     """Return the data of `margins_along_run` that one compiled program computes.
 
     Returns:
-        The times to go (TIMES + times,) [s], judged ones first; the commands; the smallest distance to the law's
-        singularity [-]; whether the run has not converged at t_f.
+        The times to go (TIMES + FURTHER_TIMES,) [s], judged ones first; the commands; the smallest distance to the
+        law's singularity [-]; whether the run has not converged at t_f.
     """
     law = parts.controller
-    further_times = jnp.geomspace(parts.period, law.t_f, times)
     distances = lapack.vmap(lambda x, t: law.singularity_distance(x, parts.reference(t)))(run.carry.x, run.period.now.t)
     nearest = jnp.min(distances / law.kinematics.singularity_distance_unit(distances[0]))
     t = run.period.now.t
@@ -223,6 +223,7 @@ def _run_data(parts: Parts, run: linear.NominalRun, times: int) -> tuple[Array, 
         for k in (0, jnp.argmax(t >= law.t_f))
     )
     not_converged = rollout.is_not_converged(final_angle, first_angle, parts.settling_angle)
+    further_times = jnp.geomspace(parts.period, law.t_f, FURTHER_TIMES)
     return jnp.append(judged_times(parts), further_times), command_history(parts, run), nearest, not_converged
 
 

@@ -510,7 +510,7 @@ def test_distance_to_the_singularity_is_the_smallest_signed_q4_of_a_run(side):
     for q4 in (0.2, 4e-4, -0.3):
         turned = jnp.asarray(side * np.vstack([q[:5], [[np.sqrt(1.0 - q4**2), 0.0, 0.0, q4]], q[6:]]))
         there = run._replace(carry=run.carry._replace(x=run.carry.x._replace(q=turned)))
-        np.testing.assert_allclose(run_margins._run_data(parts, there, 24)[2], q4, rtol=1e-12)
+        np.testing.assert_allclose(run_margins._run_data(parts, there)[2], q4, rtol=1e-12)
 
 
 def test_rounding_near_a_pole_at_one_is_not_a_crossing():
