@@ -174,9 +174,5 @@ class NoObserver(Observer):
     def forcing(self, t: Scalar, span: tuple[Scalar, Scalar], memory: Memory, d_eff: Vector) -> Memory:
         return jnp.zeros_like(memory)
 
-    def update_matrix(self, dt: Scalar) -> Matrix:
-        """Return zeros (m, m), which `update` does not use."""
-        return jnp.zeros((self.model.inputs, self.model.inputs))
-
     def update(self, matrix: Matrix, memory: Memory, impulse: Vector, t: Scalar, dt: Scalar) -> Memory:
         return memory
