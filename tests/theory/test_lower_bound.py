@@ -1,4 +1,4 @@
-"""The lower bound: closed forms, a batch least-squares estimator, a filter that attains it, and its display."""
+"""The lower bound: closed forms, a batch least-squares estimator."""
 
 import dataclasses
 import math
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from ptsmc_jax.devices import actuators, attitude_filter, attitude_sensors, sensors
+from ptsmc_jax.devices import actuators, attitude_sensors, sensors
 from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation import clock, rollout
 from ptsmc_jax.theory import lower_bound
@@ -285,33 +285,3 @@ def test_wheel_momentum_couples_the_axes():
     coupled = np.asarray(made.plant.inertia_inverse) @ np.cross(momentum, np.eye(3)).T
     # the error of RK4 is 0.04^5 / 120 for 0.3 rad/s over a period
     np.testing.assert_allclose(linear.transition[0][3:, 3:], expm(coupled * PERIOD), rtol=0, atol=1e-9)
-
-
-def test_a_filter_with_kalman_gains_attains_the_lower_bound():
-    """The random disturbance is so large that only the sensors determine the attitude, as in Farrenkopf's model.
-
-    The bound is 0.9 % lower, because it uses each gyro sample and Farrenkopf's model uses the mean over an interval.
-    """
-    star, gyro, drift, every = 2e-5, 4e-5, 2e-6, 4
-    interval, walk = PERIOD * every, drift * math.sqrt(PERIOD)
-    # gains of Farrenkopf's steady state, by his recursion
-    move, read = np.array([[1.0, -interval], [0.0, 1.0]]), np.array([[1.0, 0.0]])
-    grown = walk**2 * interval
-    spread = np.array([[gyro**2 * PERIOD * interval + grown * interval**2 / 3, -grown * interval / 2],
-                       [-grown * interval / 2, grown]])  # fmt: skip
-    p, gain = np.diag([1e-8, 1e-8]), np.zeros((2, 1))
-    for _ in range(2000):
-        gain = p @ read.T / (read @ p @ read.T + star**2)
-        p = move @ (p - gain @ read @ p) @ move.T + spread
-    k1, k2 = float(gain[0, 0]), -float(gain[1, 0])
-    own = p - gain @ read @ p
-    held = attitude_filter.AttitudeFilter(vector(k1), vector(k2), vector(np.tile(np.linalg.cholesky(p), (every, 1, 1))))
-    sensor = sensors.Sensors(vector(star), vector(gyro), vector(1e-3), vector(drift), held, every)
-    made = parts(**{**AT_REST, "t_end": 40.0})
-    made = simulated_at(made, sensors=sensor, walk_rate=vector([1e3] * 3))
-    ticks, log = lower_bound._nonzero_periods(made, still(made))
-    at_start = lower_bound.deviations(lower_bound._build_model(made, log, ticks))[:, :3]
-    after_star = at_start[::every]
-    assert len(after_star) > 50
-    # the error is half an angle
-    np.testing.assert_allclose(after_star[-1], math.sqrt(own[0, 0]) / 2, rtol=0.02)
