@@ -112,12 +112,6 @@ def test_vector_rates_equal_automatic_derivatives_of_a_moving_attitude():
         np.testing.assert_allclose(got, expected, rtol=0, atol=1000 * EPS * scale)
 
 
-def test_t_dot_times_w_equals_minus_half_w_squared_v():
-    for q, w in zip(P, W, strict=True):
-        t_dot = jax.jvp(attitude.t_matrix, (vector(q),), (attitude.derivative(vector(q), vector(w)),))[1]
-        np.testing.assert_allclose(t_dot @ w, -(w @ w) * q[:3] / 2, rtol=0, atol=20 * EPS * (w @ w))
-
-
 # rotation vectors
 
 

@@ -131,18 +131,6 @@ def test_bound_for_unequal_gains_has_the_factor_root_of_their_condition_number()
     assert error < float(bound(vector(100.0)))
 
 
-def test_bound_of_the_paper_is_violated_for_its_own_parameters():
-    """The bound (55) of the estimation error tends to c / l_m, which lacks the factor sqrt(3).
-
-    c is the bound of each component of d', and l_m is the smallest eigenvalue of L J^-1. For d' = (c, c, c), the error
-    exceeds c / l_m.
-    """
-    a = np.diag(10.0 / np.array(PAPER_INERTIA))
-    error = np.linalg.norm(worst_error(a, np.ones(3), 1e-3, 100.0))
-    assert error > 1e-3 / (10.0 / 14.0)
-    assert error < float(observer(PAPER_INERTIA, (10.0,) * 3).error_bound()(vector(100.0)))
-
-
 def test_derivative_of_the_bound_is_finite_for_equal_moments_of_inertia():
     def floor(gain):
         return observer((5.0, 5.0, 5.0), jnp.full(3, gain)).error_bound().floor

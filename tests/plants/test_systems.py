@@ -101,24 +101,6 @@ def test_law_and_jacobians_of_a_system_match_those_derived_by_hand(seed, hold):
     np.testing.assert_allclose(force, run.plant.generalised_force(t, x, u), rtol=0, atol=1e-13)
 
 
-@pytest.mark.long  # laws and observers at one state: the test above, `test_observers_others.py`
-@pytest.mark.parametrize("period", [None, 0.05])
-def test_a_spacecraft_written_as_a_system_gives_the_same_trajectory(period):
-    start = vector(0.4, -0.3, 0.2, np.sqrt(1 - 0.29))
-    others = {"inertia": FULL_INERTIA, "reference": SPIN, "q": start, "sign_width": 0.05, "delta": 0.4}
-    run = parts(8.0, 3.0, period=period, **others)
-    # x_1 and q follow from different equations, so the integration errors differ
-    run = finer(run, 8) if period is None else replace(run, substeps=4)
-    one, other = (fly(r) for r in (run, as_system(run, SPIN)))
-    assert one.status == other.status == rollout.OK
-    np.testing.assert_allclose(other.log.x[:, :3], one.log.error, rtol=0, atol=1e-10)
-    np.testing.assert_allclose(other.log.x[:, 3:], one.log.x.w, rtol=0, atol=1e-10)
-    np.testing.assert_allclose(other.log.d_hat, one.log.d_hat, rtol=0, atol=1e-10)
-    gain = 2 * 14 * 9.0 / np.maximum(8.0 - one.log.t, 0.4) ** 2  # feedback gain
-    off = np.abs(other.log.u - one.log.u).max(axis=1)
-    assert np.all(off <= 1e-10 * np.maximum(gain, 1.0))
-
-
 GAINS = {"eta": 3.0, "delta": 0.05, "k1": 1.0, "surface_rate": 1.0, "sign_width": 1e-3}
 
 

@@ -70,17 +70,6 @@ def test_spin_satisfies_the_kinematics_and_vector_rates_are_its_derivatives(rate
         np.testing.assert_allclose(v_ddot, -(size**2) / 4 * spin(vector(t)).q[:3], rtol=0, atol=20 * EPS * size**2)
 
 
-def test_vector_rates_of_a_target_with_acceleration_equal_closed_forms():
-    # rotation by the angle a(t) about a fixed axis n: v = n sin(a/2)
-    axis = np.array([2, -1, 2]) / 3
-    a, a_dot, a_ddot = 1.3, 0.4, -0.2
-    q = vector([*axis * math.sin(a / 2), math.cos(a / 2)])
-    first, second = attitude.vector_rates(q, vector(axis * a_dot), vector(axis * a_ddot))
-    np.testing.assert_allclose(first, axis * math.cos(a / 2) * a_dot / 2, rtol=0, atol=8 * EPS)
-    exact = axis * (math.cos(a / 2) * a_ddot / 2 - math.sin(a / 2) * a_dot**2 / 4)
-    np.testing.assert_allclose(second, exact, rtol=0, atol=8 * EPS)
-
-
 def test_sinusoid_and_its_time_derivative_equal_closed_forms():
     amplitude, frequency = np.array([0.01, -0.02, 0.0]), np.array([0.1, 3.0, 7.0])
     phase, bias = np.array([0.0, 1.0, -2.0]), np.array([1e-3, 0.0, -5e-3])
@@ -93,12 +82,6 @@ def test_sinusoid_and_its_time_derivative_equal_closed_forms():
         np.testing.assert_allclose(signal(vector(t)), value, rtol=0, atol=0.02 * tolerance)
         derivative = [a * f * math.cos(y) for a, f, y in zip(amplitude, frequency, x, strict=True)]
         np.testing.assert_allclose(time_derivative(signal)(vector(t)), derivative, rtol=0, atol=0.06 * tolerance)
-
-
-def test_constant_disturbance_has_derivative_zero():
-    signal = disturbances.Constant(vector([0.1, -0.2, 0.3]))
-    np.testing.assert_array_equal(signal(vector(5.0)), [0.1, -0.2, 0.3])
-    np.testing.assert_array_equal(time_derivative(signal)(vector(5.0)), np.zeros(3))
 
 
 # oscillating references and slews
