@@ -1,4 +1,4 @@
-"""Distributions of dispersed quantities by statistical tests, and the independence of their random streams."""
+"""Distributions of dispersed quantities, and the independence of their random streams."""
 
 import itertools
 import math
@@ -17,6 +17,7 @@ from ptsmc_jax.devices import actuators
 from ptsmc_jax.dispersions import base, numbers, quantities
 from ptsmc_jax.dispersions.numbers import RandomNumbers
 from ptsmc_jax.dispersions.variation import Dispersion
+from ptsmc_jax.numerics import draws
 from ptsmc_jax.signals import disturbances, references
 from tests import helpers
 from tests.helpers import chain_parts, short, vector
@@ -46,20 +47,6 @@ initial_attitudes = jax.jit(jax.vmap(initial_attitude, (None, None, 0)))
 initial_attitude_jit = jax.jit(initial_attitude)
 
 
-def sample_rotations(kind, seed=1):
-    return Rotation.from_quat(np.asarray(initial_attitudes(KINDS[kind], seed, jnp.arange(TRIALS, dtype=jnp.uint32))))
-
-
-def is_uniform(values, low, high):
-    return stats.kstest(values, "uniform", (low, high - low)).pvalue > ALARM
-
-
-def is_on_the_sphere(directions):
-    """Return whether directions are uniform: by their components (Archimedes) and the azimuth."""
-    components = [is_uniform(component, -1, 1) for component in directions.T]
-    return all(components) and is_uniform(np.arctan2(directions[:, 1], directions[:, 0]), -math.pi, math.pi)
-
-
 def test_empty_dispersion_returns_the_same_parts():
     assert Dispersion().apply(PARTS, 1, 2) is PARTS
 
@@ -74,45 +61,51 @@ def test_dispersion_of_the_initial_attitude_changes_nothing_else(kind):
     assert abs(np.linalg.norm(got.initial.q) - 1) < 8 * EPS
 
 
-def test_axis_angle_attitudes_are_relative_to_the_reference():
-    turn = REFERENCE.inv() * sample_rotations("axis_angle")
-    angles, low, high = turn.magnitude(), math.radians(20), math.radians(140)
-    assert low - 8 * EPS <= angles.min()
-    assert angles.max() <= high + 8 * EPS
-    assert is_uniform(angles, low, high)
-    axes = turn.as_rotvec() / angles[:, None]
-    assert is_on_the_sphere(axes)
-    # axis and angle are independent: six correlations
-    limit = -stats.norm.ppf(ALARM / 2 / 6) / math.sqrt(TRIALS)
-    for axis in axes.T:
-        assert abs(np.corrcoef(axis, angles)[0, 1]) < limit
-        assert abs(np.corrcoef(axis**2, angles)[0, 1]) < limit
+QUANTILES = {
+    "normal": lambda c: c,
+    "truncated_normal": stats.truncnorm(-3, 3).ppf,
+    "uniform": lambda c: 2.0 * c - 1.0,
+    "interval": lambda c: c,
+}
 
 
-def test_axis_angle_with_equal_limits_has_a_constant_angle():
-    q = initial_attitudes(numbers.axis_angle(0.7, 0.7), 5, jnp.arange(64, dtype=jnp.uint32))
-    turn = REFERENCE.inv() * Rotation.from_quat(np.asarray(q))
-    np.testing.assert_allclose(turn.magnitude(), 0.7, rtol=20 * EPS)
+@pytest.mark.parametrize("name", QUANTILES)
+def test_random_numbers_are_quantiles_of_their_distribution(name):
+    c = np.linspace(0.0, 1.0, 101)
+    kind = RandomNumbers(name, vector(np.full(101, 0.1)), vector(np.full(101, 3.0)))
+    assert kind.drawn == ("normal" if name == "normal" else "uniform")
+    np.testing.assert_allclose(kind.at(vector(c)), 3.0 + 0.1 * QUANTILES[name](c), rtol=1e-13)
 
 
-def test_uniform_attitudes_are_uniform_on_so3():
-    attitudes = sample_rotations("uniform")
-    left, right = Rotation.from_rotvec([0.3, 1.0, -2.0]), Rotation.from_rotvec([2.0, 0.1, 0.7])
-    for rotated in (attitudes, left * attitudes, attitudes * right, attitudes.inv(), REFERENCE.inv() * attitudes):
-        # the angle has the density (1 - cos a)/pi
-        assert stats.kstest(rotated.magnitude(), lambda a: (a - np.sin(a)) / np.pi).pvalue > ALARM
-        for vector_ in ([0, 0, 1], [0.6, -0.8, 0]):
-            assert is_on_the_sphere(rotated.apply(vector_))
+def parts_at(run, given):
+    """Return the parts of a trial; given: distribution and coordinates of each random quantity."""
+    coordinates = {name: vector(c) for name, (_, c) in given.items()}
+    return Dispersion({name: kind for name, (kind, _) in given.items()}).at(run, coordinates)
 
 
-def test_normal_attitudes_have_a_normal_rotation_vector_from_the_nominal_attitude():
-    r = (NOMINAL.inv() * sample_rotations("normal")).as_rotvec() / 0.1  # 180 degrees is more than 10 sigma
-    for axis in r.T:
-        assert stats.kstest(axis, "norm").pvalue > ALARM
-    sigmas = -stats.norm.ppf(ALARM / 2)
-    assert np.all(np.abs(r.mean(axis=0)) < sigmas / math.sqrt(TRIALS))
-    assert np.all(np.abs(r.var(axis=0) - 1) < sigmas * math.sqrt(2 / TRIALS))
-    assert np.abs(np.corrcoef(r.T) - np.eye(3)).max() < sigmas / math.sqrt(TRIALS)
+@pytest.mark.parametrize("c", [(0.1, 0.2, 0.0), (0.5, 0.9, 0.3), (0.97, 0.6, 1.0)])
+def test_attitudes_are_rotated_from_the_random_reference(c):
+    """The height on the sphere and the azimuth of a uniform axis are uniform (Archimedes)."""
+    spread = RandomNumbers("normal", vector([0.05] * 3))
+    got = parts_at(PARTS, {"initial_attitude": (KINDS["axis_angle"], c), "reference": (spread, [1.0, -2.0, 0.5])})
+    q_f = REFERENCE * Rotation.from_rotvec([0.05, -0.1, 0.025])
+    z, azimuth, angle = 2.0 * c[0] - 1.0, 2.0 * np.pi * c[1], np.radians(20.0 + 120.0 * c[2])
+    axis = np.array([np.sqrt(1.0 - z**2) * np.cos(azimuth), np.sqrt(1.0 - z**2) * np.sin(azimuth), z])
+    for found, expected in ((got.reference.q, q_f), (got.initial.q, q_f * Rotation.from_rotvec(angle * axis))):
+        np.testing.assert_allclose(Rotation.from_quat(np.array(found)).as_matrix(), expected.as_matrix(), atol=1e-14)
+    np.testing.assert_array_equal(got.reference.rate, PARTS.reference.rate)
+
+
+def test_initial_attitudes_and_rates_at_given_coordinates():
+    """A normalised vector of four normal numbers is a uniform attitude (Muller, 1959)."""
+    rates = RandomNumbers("normal", vector([0.01] * 3))
+    got = parts_at(PARTS, {"initial_attitude": (KINDS["normal"], [1.0, -2.0, 0.5]), "initial_rate": (rates, [0, 1, 0])})
+    turn = (NOMINAL.inv() * Rotation.from_quat(np.array(got.initial.q))).as_rotvec()
+    np.testing.assert_allclose(turn, [0.1, -0.2, 0.05], rtol=1e-13)
+    np.testing.assert_allclose(got.initial.w, PARTS.initial.w + np.array([0.0, 0.01, 0.0]), rtol=1e-15)
+    assert KINDS["uniform"].drawn == "normal"
+    q = parts_at(PARTS, {"initial_attitude": (KINDS["uniform"], [1.0, -2.0, 0.5, 0.2])}).initial.q
+    np.testing.assert_allclose(q, np.array([1.0, -2.0, 0.5, 0.2]) / np.sqrt(5.29), rtol=4 * EPS)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -138,35 +131,18 @@ def test_random_numbers_depend_only_on_seed_trial_and_quantity(kind):
     np.testing.assert_array_equal(got, initial_attitude(KINDS[kind], 3, 4))
 
 
-def test_initial_states_of_a_chain_have_their_distribution():
-    run = chain_parts([5.0, 3.0, 2.0])
-    width = vector([1.0, 0.5, 0.0])
-    trials = jnp.arange(TRIALS, dtype=jnp.uint32)
-    samples = {}
-    for name in ("uniform", "normal"):
-        dispersion = Dispersion({"initial_state": RandomNumbers(name, width)})
+def test_initial_states_of_a_chain_use_their_random_stream():
+    run, width, stream = chain_parts([5.0, 3.0, 2.0]), np.array([1.0, 0.5, 0.0]), draws.stream(3, 7, "initial_state")
+    for name, standard in (("uniform", 2.0 * draws.uniforms(stream, 3) - 1.0), ("normal", draws.normals(stream, 3))):
+        dispersion = Dispersion({"initial_state": RandomNumbers(name, vector(width))})
         assert dispersion.varies
-        x0 = np.asarray(jax.jit(jax.vmap(lambda k, dispersion=dispersion: dispersion.apply(run, 3, k).initial))(trials))
-        np.testing.assert_array_equal(x0[:, 2], 2.0)
-        samples[name] = (x0[:, :2] - [5.0, 3.0]) / [1.0, 0.5]
-        np.testing.assert_array_equal(dispersion.apply(run, 3, 7).initial, x0[7])
-    uniform, normal = samples["uniform"], samples["normal"]
-    assert np.abs(uniform).max() <= 1.0
-    for k in range(2):
-        assert stats.kstest(uniform[:, k], "uniform", (-1.0, 2.0)).pvalue > ALARM
-        assert stats.kstest(normal[:, k], "norm").pvalue > ALARM
-    limit = -stats.norm.ppf(ALARM / 2) / math.sqrt(TRIALS)
-    assert abs(np.corrcoef(uniform.T)[0, 1]) < limit
+        x0 = dispersion.apply(run, 3, 7).initial
+        np.testing.assert_allclose(x0, run.initial + width * standard, rtol=8 * EPS)
     assert not Dispersion().varies
 
 
 def uniform_phases(count):
     return RandomNumbers("interval", vector(np.full(count, 2.0 * np.pi)))
-
-
-def parts_of_trials(dispersion, run=PARTS, count=TRIALS, seed=4):
-    """Return the parts of many trials, with a leading axis."""
-    return jax.jit(jax.vmap(lambda k: dispersion.apply(run, seed, k)))(jnp.arange(count, dtype=jnp.uint32))
 
 
 def sample_inertias(moments, std, turn=0.0, axes=None):
@@ -177,19 +153,6 @@ def sample_inertias(moments, std, turn=0.0, axes=None):
 
 
 plants_of = jax.jit(jax.vmap(lambda whole, k: whole.apply(PARTS, 4, k).plant, (None, 0)))
-
-
-def test_principal_moments_are_truncated_normal():
-    """For these moments, every sample within three sigma is physical, so that no sample is rejected."""
-    inertia, inverse = sample_inertias([10.0, 12.0, 14.0], 0.05)
-    assert np.abs(inertia - inertia * np.eye(3)).max() == 0.0
-    np.testing.assert_allclose(inertia @ inverse, np.broadcast_to(np.eye(3), inertia.shape), atol=1e-14)
-    standard = (np.diagonal(inertia, axis1=1, axis2=2) / [10.0, 12.0, 14.0] - 1.0) / 0.05
-    assert 2.9 < np.abs(standard).max() <= 3.0 + 1e-9  # without truncation 44 of 16 384 samples would exceed it
-    for axis in standard.T:
-        assert stats.kstest(axis, stats.truncnorm(-3, 3).cdf).pvalue > ALARM
-    limit = -stats.norm.ppf(ALARM / 2) / math.sqrt(TRIALS)
-    assert np.abs(np.corrcoef(standard.T) - np.eye(3)).max() < limit
 
 
 @pytest.mark.parametrize("moments", [[1.0, 1.0, 2.0], [5.0, 9.0, 13.9], [10.0, 12.0, 14.0]])
@@ -288,37 +251,28 @@ def test_sampled_inertias_have_finite_derivatives(moments):
 
 
 def test_principal_axes_are_rotated_by_a_normal_rotation_vector():
-    rotation = Rotation.from_rotvec([0.3, -0.2, 0.9])
-    inertia, _ = sample_inertias([5.0, 10.0, 14.0], 0.0, turn=0.01, axes=rotation.as_matrix())
-    # to first order J' = A (D + [r]x D - D [r]x) A': off-diagonal (i, j) of A' J' A is r_k (D_i - D_j), up to sign
-    inner = rotation.as_matrix().T @ inertia @ rotation.as_matrix()
-    for i, j in ((0, 1), (0, 2), (1, 2)):
-        turn = inner[:, i, j] / ([5.0, 10.0, 14.0][j] - [5.0, 10.0, 14.0][i]) / 0.01
-        assert abs(np.std(turn) - 1.0) < 0.04  # sampling error 0.006, second order 0.01
-    np.testing.assert_allclose(np.linalg.eigvalsh(inertia), [[5.0, 10.0, 14.0]] * TRIALS, rtol=1e-12)
+    axes, moments = Rotation.from_rotvec([0.3, -0.2, 0.9]), np.array([5.0, 10.0, 14.0])
+    kind = numbers.RelativeInertia(vector(moments), vector(axes.as_matrix()), vector(0.0), vector(0.01))
+    c = np.zeros(kind.count)
+    c[3 * numbers.CANDIDATES :][:3] = [1.0, -2.0, 0.5]
+    turned = (axes * Rotation.from_rotvec([0.01, -0.02, 0.005])).as_matrix()
+    np.testing.assert_allclose(kind.at(vector(c))[0], turned @ np.diag(moments) @ turned.T, atol=1e-13)
 
 
 SINE = disturbances.Sinusoid(*(vector(v) for v in ([0.1] * 3, [0.2] * 3, [0.0, 0.5, 1.0], [0.0] * 3)))
 ORBIT = disturbances.GravityGradient(PARTS.plant.inertia, vector([0.0, 0.0, 0.0, 1.0]), vector(1e-3), vector(0.25))
 
 
-def test_phases_are_uniform_and_independent():
-    still = disturbances.Constant(vector([0.1, 0.2, 0.3]))
-    run = replace(PARTS, disturbance=disturbances.Sum((SINE, still, ORBIT, SINE)))
-    got = parts_of_trials(Dispersion({"disturbance_phase": uniform_phases(7)}), run).disturbance.terms
-    np.testing.assert_array_equal(got[1].amplitude, np.broadcast_to(still.amplitude, (TRIALS, 3)))
-    turns = np.column_stack(
-        [
-            np.asarray(got[0].phase) - np.asarray(SINE.phase),
-            np.asarray(got[2].phase) - 0.25,
-            np.asarray(got[3].phase) - np.asarray(SINE.phase),
-        ]
-    )
-    assert turns.shape == (TRIALS, 7)
-    for axis in turns.T:
-        assert is_uniform(axis, 0.0, 2 * math.pi)
-    limit = -stats.norm.ppf(ALARM / 2) / math.sqrt(TRIALS)
-    assert np.abs(np.corrcoef(turns.T) - np.eye(7)).max() < limit
+STILL = disturbances.Constant(vector([0.1, 0.2, 0.3]))
+C = np.random.default_rng(0).uniform(size=7)
+
+
+def test_phases_are_added_to_all_periodic_terms():
+    run = replace(PARTS, disturbance=disturbances.Sum((SINE, STILL, ORBIT, SINE)))
+    got = parts_at(run, {"disturbance_phase": (uniform_phases(7), C)}).disturbance.terms
+    np.testing.assert_array_equal(got[1].amplitude, STILL.amplitude)
+    for term, nominal, c in ((got[0], SINE, C[:3]), (got[2], ORBIT, C[3]), (got[3], SINE, C[4:])):
+        np.testing.assert_allclose(term.phase, nominal.phase + 2.0 * np.pi * c, rtol=8 * EPS)
 
 
 def test_gravity_gradient_acts_on_the_sampled_inertia():
@@ -339,53 +293,26 @@ TENTH = RandomNumbers("truncated_normal", vector([0.1]))
 WIDE = RandomNumbers("uniform", vector([0.5]))
 
 
-def test_relative_dispersions_are_truncated_not_clipped():
-    """The factors have the truncated normal or the uniform distribution, without repeated values at the ends."""
-    got = parts_of_trials(Dispersion({"torque_limit_level": TENTH, "attitude_noise_level": WIDE}), LIMITED)
-    normal = (np.asarray(got.actuators.torque_limit) / 0.5 - 1.0) / 0.1
-    uniform = np.asarray(got.sensors.attitude_noise) / 1e-5
-    assert stats.kstest(normal, stats.truncnorm(-3, 3).cdf).pvalue > ALARM
-    assert is_uniform(uniform, 0.5, 1.5)
-    assert 2.9 < np.abs(normal).max() < 3.0
-    assert len(np.unique(normal)) == len(np.unique(uniform)) == TRIALS
-    np.testing.assert_array_equal(got.sensors.rate_noise, np.full(TRIALS, 1e-6))
-    limit = -stats.norm.ppf(ALARM / 2) / math.sqrt(TRIALS)
-    assert abs(np.corrcoef(normal, uniform)[0, 1]) < limit
+def test_relative_dispersions_scale_the_nominal_value():
+    got = parts_at(LIMITED, {"torque_limit_level": (TENTH, C[:1]), "attitude_noise_level": (WIDE, C[1:2])})
+    assert got.actuators.torque_limit is not None
+    np.testing.assert_allclose(got.actuators.torque_limit, 0.5 * (1.0 + TENTH.at(vector(C[:1]))[0]), rtol=8 * EPS)
+    np.testing.assert_allclose(got.sensors.attitude_noise, 1e-5 * (0.5 + C[1]), rtol=8 * EPS)
+    np.testing.assert_array_equal(got.sensors.rate_noise, 1e-6)
 
 
 def test_amplitudes_are_scaled_independently_and_a_bias_is_added():
-    still = disturbances.Constant(vector([0.1, 0.2, 0.3]))
-    run = replace(PARTS, disturbance=disturbances.Sum((SINE, ORBIT, still)))
-    added = RandomNumbers("normal", vector([0.01] * 3))
-    factors = RandomNumbers("uniform", vector([0.5] * 6))
-    spread = Dispersion({"disturbance_bias": added, "disturbance_amplitude": factors})
-    sine, orbit, constant, bias = parts_of_trials(spread, run).disturbance.terms
-    factors = np.column_stack([np.asarray(sine.amplitude) / 0.1, np.asarray(constant.amplitude) / [0.1, 0.2, 0.3]])
-    for column in factors.T:
-        assert is_uniform(column, 0.5, 1.5)
-    for column in np.asarray(bias.amplitude).T:
-        assert stats.kstest(column / 0.01, "norm").pvalue > ALARM
-    columns = np.column_stack([factors, np.asarray(bias.amplitude)])
-    limit = -stats.norm.ppf(ALARM / 2) / math.sqrt(TRIALS)
-    assert np.abs(np.corrcoef(columns.T) - np.eye(9)).max() < limit
-    np.testing.assert_array_equal(orbit.phase, np.full(TRIALS, 0.25))
-    alone = Dispersion({"disturbance_bias": added}).apply(replace(PARTS, disturbance=SINE), 4, 9).disturbance
-    np.testing.assert_array_equal(alone.terms[-1].amplitude, bias.amplitude[9])
+    run = replace(PARTS, disturbance=disturbances.Sum((SINE, ORBIT, STILL)))
+    added, factors = RandomNumbers("normal", vector([0.01] * 3)), RandomNumbers("uniform", vector([0.5] * 6))
+    given = {"disturbance_bias": (added, [1.0, -2.0, 0.5]), "disturbance_amplitude": (factors, C[:6])}
+    sine, orbit, constant, bias = parts_at(run, given).disturbance.terms
+    np.testing.assert_allclose(sine.amplitude, 0.1 * (0.5 + C[:3]), rtol=8 * EPS)
+    np.testing.assert_allclose(constant.amplitude, STILL.amplitude * (0.5 + C[3:6]), rtol=8 * EPS)
+    np.testing.assert_allclose(bias.amplitude, [0.01, -0.02, 0.005], rtol=8 * EPS)
+    assert orbit.phase == 0.25
+    alone = parts_at(replace(PARTS, disturbance=SINE), {"disturbance_bias": given["disturbance_bias"]}).disturbance
     t = vector(3.7)
-    np.testing.assert_allclose(alone(t, PARTS.initial), SINE(t) + bias.amplitude[9], rtol=1e-14)
-
-
-def test_initial_attitude_is_relative_to_the_random_reference():
-    spread = RandomNumbers("normal", vector([0.05] * 3))
-    dispersion = Dispersion({"initial_attitude": KINDS["axis_angle"], "reference": spread})
-    got = parts_of_trials(dispersion)
-    q_f = Rotation.from_quat(np.asarray(got.reference.q))
-    for axis in ((REFERENCE.inv() * q_f).as_rotvec() / 0.05).T:
-        assert stats.kstest(axis, "norm").pvalue > ALARM
-    same = sample_rotations("axis_angle", seed=4)  # the rotation from the reference does not depend on the reference
-    turn = (q_f.inv() * Rotation.from_quat(np.asarray(got.initial.q))).as_quat(canonical=True)
-    np.testing.assert_allclose(turn, (REFERENCE.inv() * same).as_quat(canonical=True), atol=1e-14)
-    np.testing.assert_array_equal(got.reference.rate, np.broadcast_to([0.1, 0.0, 0.2], (TRIALS, 3)))
+    np.testing.assert_allclose(alone(t, PARTS.initial), SINE(t) + bias.amplitude, rtol=1e-14)
 
 
 def test_random_numbers_of_a_quantity_do_not_depend_on_other_quantities():
@@ -410,20 +337,6 @@ def test_random_numbers_of_a_quantity_do_not_depend_on_other_quantities():
         assert not np.array_equal(read(alone), read(Dispersion({"disturbance_bias": tenths}).apply(LIMITED, 1, 1)))
     c = dispersion.coordinates(7, 8)
     assert len({float(v[0]) for v in c.values()}) == len(c) == 9
-
-
-def test_at_with_the_coordinates_of_a_trial_equals_apply():
-    rates = RandomNumbers("normal", vector([0.01] * 3))
-    dispersion = Dispersion({"initial_attitude": KINDS["axis_angle"], "initial_rate": rates})
-    at = dispersion.at(PARTS, dispersion.coordinates(3, 9))
-    applied = dispersion.apply(PARTS, 3, 9)
-    jax.tree.map(np.testing.assert_array_equal, at.initial, applied.initial)
-    middle = dispersion.at(
-        PARTS, {"initial_attitude": vector([0.5, 0.0, 1.0]), "initial_rate": vector([0.0, 1.0, 0.0])}
-    )
-    turn = (REFERENCE.inv() * Rotation.from_quat(np.asarray(middle.initial.q))).as_rotvec()
-    np.testing.assert_allclose(turn, [math.radians(140.0), 0.0, 0.0], atol=1e-12)
-    np.testing.assert_allclose(middle.initial.w, PARTS.initial.w + np.array([0.0, 0.01, 0.0]), rtol=1e-15)
 
 
 def test_columns_of_quantities_have_units():
