@@ -300,16 +300,6 @@ def test_widest_allowed_coupling_is_physical_at_its_extreme_and_a_wider_one_is_r
         scenario.from_tables({**tables, "dispersion": {**dispersion, "mode_coupling": wider}})
 
 
-def test_hardware_errors_have_independent_streams():
-    """The random numbers of one error do not depend on other dispersed errors."""
-    ready = [
-        scenario.study(scenario.from_tables({**FLIGHT, "dispersion": some})).dispersion
-        for some in (DISPERSION, {"gyro_scale": DISPERSION["gyro_scale"]})
-    ]
-    one, other = (dispersion.coordinates(jnp.uint32(5), jnp.uint32(2))["gyro_scale"] for dispersion in ready)
-    np.testing.assert_array_equal(one, other)
-
-
 @pytest.mark.parametrize(
     ("frequency", "largest"),
     [({"kind": "relative_uniform", "half_width": 0.4}, 1.4), ({"kind": "relative_normal", "std": 0.1}, 1.3)],

@@ -1,25 +1,18 @@
-"""Random streams against the documented rule, published test vectors and statistical tests."""
+"""Random streams against the documented rule and published test vectors, and the uniqueness of their names."""
 
 import ast
 import importlib
 import math
 import zlib
-from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import stats
 
 from ptsmc_jax.batching import lanes
 from ptsmc_jax.numerics import draws
 from tests.tree import modules
-
-# Probability of a false alarm of one statistical check. The seeds are fixed, so the result never changes.
-ALARM = 1e-6
-SIGMAS = -stats.norm.ppf(ALARM / 2)
-
 
 # the rule in Python integers
 
@@ -186,49 +179,3 @@ def test_stream_names_are_unique_and_their_hashes_differ():
     assert {"attitude_noise", "rate_noise", "initial_attitude"} <= set(names)
     assert len(names) == len(set(names))  # two uses of one name would have equal random numbers
     assert len({zlib.crc32(name.encode()) for name in names}) == len(names)
-
-
-# statistics
-
-
-@pytest.fixture(scope="module")
-def sheet():
-    """Normal numbers (samples, 128): 16 trials, two stream names and four numbers in each sample."""
-
-    @jax.jit
-    def rows(samples):
-        def one(sample, trial, name):
-            return draws.normals(draws.stream(9, trial, name), 4, sample)
-
-        trials = jnp.arange(16, dtype=jnp.uint32)
-        columns = [jax.vmap(partial(one, name=name), (None, 0)) for name in ("attitude_noise", "rate_noise")]
-        return jax.vmap(lambda s: jnp.stack([column(s, trials) for column in columns]).reshape(-1))(samples)
-
-    return np.asarray(rows(jnp.arange(-8192, 8192)))
-
-
-def test_normals_have_the_right_tails_up_to_five_sigma():
-    key, batches, batch = draws.stream(4, 5, "tails"), 8, 2**19
-    limits = range(1, 6)
-
-    @partial(jax.jit, compiler_options={"xla_backend_optimization_level": 3})  # `conftest` sets a lower level
-    def count(first):
-        n = jax.vmap(partial(draws.normals, key, 4))(first + jnp.arange(batch, dtype=jnp.uint32))
-        beyond = [jnp.stack([jnp.sum(n > limit), jnp.sum(n < -limit)]) for limit in limits]
-        return jnp.stack(beyond), jnp.max(jnp.abs(n))
-
-    counted = [count(jnp.uint32(k * batch)) for k in range(batches)]
-    beyond = np.sum([c[0] for c in counted], axis=0)
-    total = batches * batch * 4  # 16.8 million, of which 10 exceed 5 sigma
-    for limit, sides in zip(limits, beyond, strict=True):
-        for count_, tails in ((sides[0], 1), (sides[1], 1), (sides.sum(), 2)):
-            assert stats.binomtest(int(count_), total, tails * float(stats.norm.sf(limit))).pvalue > ALARM
-    assert max(float(c[1]) for c in counted) < 6.77
-
-
-def test_streams_are_uncorrelated_across_trials_names_and_components(sheet):
-    # 128 columns have 8128 pairs: a pair has a false alarm with a probability of 1e-6 / 8128
-    limit = -stats.norm.ppf(ALARM / 2 / 8128) / math.sqrt(len(sheet))
-    for values in (sheet, sheet**2, np.sign(sheet), np.abs(sheet)):
-        correlations = np.corrcoef(values.T) - np.eye(sheet.shape[1])
-        assert np.abs(correlations).max() < limit
