@@ -167,7 +167,7 @@ MOMENTA = [[0.5, -0.2, 0.1, 0.3], [40.0, 0.0, 0.0, 0.0]]
 @pytest.mark.parametrize("momentum", MOMENTA)
 @pytest.mark.parametrize(("lag", "limit"), short(CHANNELS, CHANNELS[::3]))
 def test_wheels_exchange_momentum_with_the_body(momentum, lag, limit):
-    """The total inertial angular momentum is constant, and the attitude equals an independent integration."""
+    """Attitude and wheel momenta equal an independent integration."""
     hardware_table = {"torque_lag": lag, "torque_rate_limit": limit if np.isfinite(limit) else None}
     tables = {
         "spacecraft": {"inertia": FULL_INERTIA},
@@ -182,26 +182,12 @@ def test_wheels_exchange_momentum_with_the_body(momentum, lag, limit):
     simulated = runs.simulate(as_many(ready))
     log, axes, inertia = simulated.log, PYRAMID.T, np.asarray(FULL_INERTIA)
     assert log.wheels is not None
-    total = [
-        Rotation.from_quat(q).apply(inertia @ w + axes @ h)
-        for q, w, h in zip(log.x.q, log.x.w, log.wheels[0], strict=True)
-    ]
-    # the error of RK4 is at most (0.025 rad)^5 / 120 per step, relative to the rotating part of the momentum
-    np.testing.assert_allclose(total, np.tile(total[0], (len(total), 1)), atol=1e-10 * float(np.linalg.norm(total[0])))
     q, h = wheels_by_an_adaptive_integrator(inertia, axes, log, lag, limit, intervals := 80)
     off = Rotation.from_quat(q).inv() * Rotation.from_quat(log.x.q[intervals])
     assert off.magnitude() < 1e-9
     np.testing.assert_allclose(log.wheels[0][intervals], h, rtol=0, atol=1e-12 * max(np.abs(momentum)) + 1e-13)
-    assert [name for name in simulated.columns() if name[0] in "hv"] == [
-        "h1",
-        "h2",
-        "h3",
-        "h4",
-        "v1",
-        "v2",
-        "v3",
-        "v4",
-    ]  # of trajectory.csv
+    wheel_columns = [name for name in simulated.columns() if name[0] in "hv"]  # of trajectory.csv
+    assert wheel_columns == [f"{name}{k}" for name in "hv" for k in range(1, 5)]
     largest = simulated.metrics["peak_wheel_momentum"]
     assert largest >= np.abs(log.wheels[0]).max()  # t = 0 counts too
     np.testing.assert_allclose(largest, np.abs(log.wheels[0]).max(), rtol=2e-3)
