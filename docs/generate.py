@@ -200,18 +200,36 @@ def _case_i(plant: str) -> Mapping[str, Mapping[str, Any]]:
 
 
 def _dispersion(struct: type[Table], unit_of_d: str) -> Iterator[str]:
-    rows = [row for key in keys.list_keys(struct) for row in _kinds(key, layouts.DISPERSIONS[key.name], unit_of_d)]
-    yield _grid("key meaning entries effect", rows)
+    """Yield a table of the keys, and a table of their kinds, many of which several keys have."""
+    rows, users = [], dict[tuple[str, type[Table]], list[str]]()
+    for key in keys.list_keys(struct):
+        names = [f'`"{kind}"`' for kind in layouts.DISPERSIONS[key.name]]
+        names[0] += " (default)" * (len(names) > 1)
+        rows.append([f"`{key.name}`", key.meaning, ", ".join(names)])
+        for one in layouts.DISPERSIONS[key.name].items():
+            users.setdefault(one, []).append(f"`{key.name}`")
+    yield _grid("key meaning kinds", rows)
+    yield "The kinds, their entries and the allowed values:"
+    kinds = [
+        [f'`kind = "{kind}"`', ", ".join(named), _entries(table, unit_of_d), keys.description(table)]
+        for (kind, table), named in users.items()
+    ]
+    yield _grid("kind keys entries effect", kinds)
 
 
-def _kinds(key: keys.Key, kinds: Kinds, unit_of_d: str = keys.UNIT_OF_D) -> Iterator[list[str]]:
+def _kinds(key: keys.Key, kinds: Kinds) -> Iterator[list[str]]:
     """Yield a row for each kind of an inline table."""
     for kind, struct in kinds.items():
-        given = [f'`kind = "{kind}"`']
-        for k in keys.list_keys(struct, unit_of_d):
-            said = [f"default {shown}" if (shown := _default(k.default)) else "", k.text]
-            given.append(f"`{k.name}`: {', '.join(filter(None, said))}")
-        yield [f"`{key.name}`", key.meaning, "; ".join(given), keys.description(struct)]
+        yield [f"`{key.name}`", key.meaning, f'`kind = "{kind}"`; {_entries(struct)}', keys.description(struct)]
+
+
+def _entries(struct: type[Table], unit_of_d: str = keys.UNIT_OF_D) -> str:
+    """Return the entries of an inline table: name, allowed values, default and meaning of each."""
+    entries = []
+    for key in keys.list_keys(struct, unit_of_d):
+        default = f", default {shown}" if (shown := _default(key.default)) else ""
+        entries.append(f"`{key.name}` ({key.allowed}{default}): {key.text}")
+    return "; ".join(entries)
 
 
 def _shown(key: keys.Key, struct: type[Table], fallback: Mapping[str, Any]) -> str:

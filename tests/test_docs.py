@@ -18,7 +18,7 @@ import pytest
 
 import ptsmc_jax
 from ptsmc_jax import scenario
-from ptsmc_jax.scenario import from_tables, layouts
+from ptsmc_jax.scenario import from_tables, keys, layouts
 from ptsmc_jax.simulation import catalogues
 from tests.helpers import SHORT, SHORT_CHAIN
 from tests.onboard.flights import PROFILE
@@ -71,6 +71,14 @@ def test_reference_pages_name_every_key_and_metric():
                 ), struct
     for catalogue in catalogues.CATALOGUES.values():
         assert all(f"| `{metric}` | {entry.unit} | " in metric_list for metric, entry in catalogue.items())
+
+
+def test_the_scenario_page_states_the_allowed_values_of_every_dispersion():
+    page = MADE["scenarios.md"]()
+    for kinds in layouts.DISPERSIONS.values():
+        for struct in kinds.values():
+            for key in keys.list_keys(struct):
+                assert f"`{key.name}` ({key.allowed}" in page, (struct, key.name)
 
 
 def test_the_guides_name_every_command():

@@ -186,10 +186,6 @@ def _check_dispersion(scenario: Scenario) -> None:
             smallest, largest = getattr(table, low, None), getattr(table, high, None) or scenario.end
             if smallest is not None and smallest > largest:
                 raise wrong(f"dispersion.{name}.{low}", smallest, f"at most {high}, {largest}{unit}")
-    if "timing_jitter" in random and not random["timing_jitter"].largest < 0.5:
-        raise wrong(
-            "dispersion.timing_jitter.largest", random["timing_jitter"].largest, "below 0.5, half a control period"
-        )
     if "x0" in random:
         key, state_count = random["x0"].width_key, len(scenario.plant.x0)
         value = getattr(random["x0"], key)

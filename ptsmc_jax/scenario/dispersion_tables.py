@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 Angle = Annotated[float, Meta(ge=0, le=180, description="an angle from 0 to 180")]
 SmallFraction = Annotated[float, Meta(ge=0, le=0.3, description="a number from 0 to 0.3")]
+BelowHalf = Annotated[float, Meta(gt=0, lt=0.5, description="a number greater than 0 and below 0.5")]
 BelowOne = Annotated[float, Meta(ge=0, lt=1, description="a number from 0 to below 1")]
 
 
@@ -171,7 +172,7 @@ class AxisAngle(Table, frozen=True):
     """A uniform angle about a random axis: of the body from the reference at t = 0, or of the reference."""
 
     kind: Literal["axis_angle"] = "axis_angle"
-    min_deg: Annotated[Angle, Meaning("smallest angle", "deg")] = 20.0
+    min_deg: Annotated[Angle, Meaning("smallest angle, at most max_deg", "deg")] = 20.0
     max_deg: Annotated[Angle, Meaning("largest angle", "deg")] = 140.0
 
     def largest_angle(self, angle: float) -> float:
@@ -270,7 +271,7 @@ class UniformPhase(Table, frozen=True):
 class Interval(Table, frozen=True):
     """A uniform time between two times."""
 
-    earliest: Annotated[NotNegative, Meaning("earliest start", "s")] = 0.0
+    earliest: Annotated[NotNegative, Meaning("earliest start, at most latest", "s")] = 0.0
     latest: Annotated[NotNegative | None, Meaning("latest start; default: loop.t_end", "s")] = None
 
     def numbers(self, parts: "Parts", low: float, high: float) -> RandomNumbers:
@@ -313,10 +314,8 @@ class Jitter(Table, frozen=True):
     """Random sample times. A trial has a random largest error, and each sample a uniform error up to this size."""
 
     kind: Literal["uniform"] = "uniform"
-    largest: Annotated[
-        Positive, Meaning("largest timing error, as a fraction of loop.period below 0.5")
-    ] = 0.1  # fmt: skip
-    smallest: Annotated[NotNegative, Meaning("smallest value of the largest timing error")] = 0.0
+    largest: Annotated[BelowHalf, Meaning("largest timing error, as a fraction of loop.period")] = 0.1
+    smallest: Annotated[NotNegative, Meaning("smallest value of the largest timing error, at most largest")] = 0.0
 
     def build(self, parts: "Parts", count: int) -> RandomNumbers:
         """Return the distribution of the random numbers."""
