@@ -4,7 +4,9 @@ import contextlib
 import dataclasses
 import json
 import math
+import re
 import tomllib
+from collections.abc import Iterable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -103,6 +105,14 @@ trials = 8
 starts = 2
 steps = 4
 """
+
+
+def undocumented(columns: Iterable[str]) -> set[str]:
+    """Return the columns of `trajectory.csv`, without their numbers, that docs/output_files.md does not list."""
+    page = (ROOT / "docs" / "output_files.md").read_text(encoding="utf-8")
+    part = page[page.index("## Columns of trajectory.csv") : page.index("## Columns of other tables")]
+    documented = {name for row in part.splitlines() for name in re.findall(r"`([a-z_]+)\d*`", row.split(" | ")[0])}
+    return {name.rstrip("0123456789") for name in columns} - documented
 
 
 def untuned(text: str) -> dict[str, Any]:

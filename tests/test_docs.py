@@ -18,12 +18,14 @@ import pytest
 
 import ptsmc_jax
 from ptsmc_jax import scenario
+from ptsmc_jax.campaigns import store
 from ptsmc_jax.scenario import from_tables, keys, layouts
 from ptsmc_jax.simulation import catalogues
 from tests.helpers import SHORT, SHORT_CHAIN
 from tests.onboard.flights import PROFILE
 from tests.tree import ROOT, modules
 from tuning.cli.main import app
+from tuning.studies import campaign_folder, compare, mapping
 
 DOCS = ROOT / "docs"
 GENERATE = runpy.run_path(str(DOCS / "generate.py"))
@@ -81,6 +83,13 @@ def test_the_scenario_page_states_the_allowed_values_of_every_dispersion():
                 assert f"`{key.name}` ({key.allowed}" in page, (struct, key.name)
 
 
+def test_the_page_of_output_files_names_the_columns_and_files_that_the_code_writes():
+    page = (DOCS / "output_files.md").read_text()
+    named = [*mapping.Cell.__dataclass_fields__, *compare.MODEL_ERRORS, store.JOURNAL, campaign_folder.THEORY]
+    for name in {*named, campaign_folder.TABLE, *store.MADE_OF_RESULTS} - {"x", "y"}:
+        assert f"`{name}`" in page or f"`window_error_{name}`" in page, name
+
+
 def test_the_guides_name_every_command():
     guides = "\n".join(path.read_text() for path in DOCS.glob("*.md") if path.name != "commands.md")
     assert not [command for command in COMMANDS if not re.search(rf"`(ptsmc )?{command}\b|ptsmc {command}\b", guides)]
@@ -126,7 +135,7 @@ def test_names_in_the_text_exist(path):
     for place, name in re.findall(r"`((?:[a-z_\d]+\.)+)([A-Za-z_]\w*)(?:\([^`]*\))?`", text):
         meant = [module for module in modules() if f".{module}.".endswith(f".{place}")]
         is_key = place[:-1] in layouts.TABLES["chain"]  # such as plant.x0
-        if meant and not is_key and name not in "aem c csv h html ipynb json md png py toml".split():
+        if meant and not is_key and name not in "aem bin c csv h html ipynb json md png py toml".split():
             assert any(hasattr(importlib.import_module(module), name) for module in meant), place + name
     for file in re.findall(r"`((?:tests|docs|scenarios|benchmarks|notebooks)/[a-z\d_./]+)`", text):
         assert (ROOT / file).exists(), file

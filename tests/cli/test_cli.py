@@ -14,7 +14,18 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo, runs
 from ptsmc_jax.scenario import timing
 from ptsmc_jax.simulation import catalogues
-from tests.helpers import PAPER_ATTITUDE, QUICKLY, ROOT, SHORT, SHORT_CHAIN, refused, short, small_search, tree
+from tests.helpers import (
+    PAPER_ATTITUDE,
+    QUICKLY,
+    ROOT,
+    SHORT,
+    SHORT_CHAIN,
+    refused,
+    short,
+    small_search,
+    tree,
+    undocumented,
+)
 from tests.output.pages import checked
 from tuning.output import formats
 from tuning.studies import compare, judging, single, stability
@@ -30,6 +41,7 @@ def test_simulate_writes_its_result_folder(command, tmp_path):
     header, *rows = (folder / "trajectory.csv").read_text().splitlines()
     logged = "measured_q1,measured_q2,measured_q3,measured_q4,measured_w1,measured_w2,measured_w3,sent1,sent2,sent3"
     assert header == f"t,q1,q2,q3,q4,w1,w2,w3,d_hat1,d_hat2,d_hat3,u1,u2,u3,s1,s2,s3,{logged}"
+    assert undocumented(header.split(",")) == set()
     values = np.array([[float(v) for v in row.split(",")] for row in rows])
     assert values[0, 0] == 0.0
     assert values[-1, 0] == 6.5

@@ -22,7 +22,7 @@ from ptsmc_jax.onboard.library import InTheLoop, Library
 from ptsmc_jax.onboard.templates import STATUS
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import computer
-from tests.helpers import gpus, short
+from tests.helpers import gpus, short, undocumented
 from tests.onboard.compiled import needs_compiler, program, replayed, step_many
 from tests.onboard.flights import FLIGHTS
 
@@ -62,6 +62,7 @@ def test_compiled_controller_in_the_loop_equals_the_simulation(name, exported):
     assert sum(theirs.samples.values()) == theirs.samples["ok"] + theirs.samples["saturated"] == len(ours.log.t) - 1
     assert ours.samples == {}
     of_ours = ours.columns()
+    assert undocumented(of_ours) == set()
     for column, other in theirs.columns().items():  # without the last row, whose s comes from the law in Python
         value, other = of_ours[column], other[:-1]
         np.testing.assert_allclose(

@@ -12,7 +12,7 @@ from ptsmc_jax import formulas, scenario
 from ptsmc_jax.campaigns import runs
 from ptsmc_jax.plants import flexible_body, rigid_body
 from ptsmc_jax.simulation import control_period
-from tests.helpers import vector
+from tests.helpers import undocumented, vector
 
 FINE = 40  # steps per control period
 EPS = np.finfo(float).eps
@@ -112,6 +112,7 @@ def test_metrics_and_columns_of_the_modes(simulated):
     np.testing.assert_allclose(metrics["residual_modal"], size[log.t >= 12.0].max(), rtol=1e-13)
     assert metrics["residual_modal"] < metrics["peak_modal"]
     columns = simulated.columns()
+    assert undocumented(columns) == set()
     modes = [*(f"e{k}" for k in range(1, 5)), *(f"e_dot{k}" for k in range(1, 5))]
     assert [name for name in columns if name in modes] == modes
     np.testing.assert_array_equal(columns["e_dot2"], log.x.modes.rate[:, 1])
