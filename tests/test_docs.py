@@ -90,6 +90,16 @@ def test_the_page_of_output_files_names_the_columns_and_files_that_the_code_writ
         assert f"`{name}`" in page or f"`window_error_{name}`" in page, name
 
 
+def test_the_code_prints_the_messages_of_the_troubleshooting_page():
+    code = "\n".join(path.read_text() for name in ("ptsmc_jax", "tuning") for path in sorted((ROOT / name).rglob("*.py")))
+    code = re.sub(r'"\s+f?"', "", code)  # join the parts of long texts
+    headings, found = re.compile(r"^\| message \|.*\n\| --- .*\n((?:\|.*\n)+)", re.M), []
+    for rows in headings.findall((DOCS / "troubleshooting.md").read_text()):
+        found += [row.split(" | ")[0].removeprefix("| ") for row in rows.splitlines()]
+    assert len(found) > 30
+    assert not [part for text in found for part in text.split("...") if part.strip() not in code]
+
+
 def test_the_guides_name_every_command():
     guides = "\n".join(path.read_text() for path in DOCS.glob("*.md") if path.name != "commands.md")
     assert not [command for command in COMMANDS if not re.search(rf"`(ptsmc )?{command}\b|ptsmc {command}\b", guides)]
