@@ -63,9 +63,8 @@ class Spacecraft(Table, frozen=True):
     inertia: Annotated[
         Inertia,
         Meaning(
-            "three principal moments, or a full symmetric 3x3 tensor, off its diagonal -sum m x y "
-            "(products of inertia with their sign changed, where these are +sum m x y); with [wheels] of "
-            "the whole spacecraft less each wheel's spin inertia about its axis",
+            "three principal moments, or a symmetric 3x3 tensor with the entries -sum m x y off its diagonal. With "
+            "[wheels] it is the inertia of the whole spacecraft minus the spin inertia of each wheel about its axis",
             "kg m^2",
         ),
     ] = (10.0, 12.0, 14.0)
