@@ -91,7 +91,8 @@ def test_the_page_of_output_files_names_the_columns_and_files_that_the_code_writ
 
 
 def test_the_code_prints_the_messages_of_the_troubleshooting_page():
-    code = "\n".join(path.read_text() for name in ("ptsmc_jax", "tuning") for path in sorted((ROOT / name).rglob("*.py")))
+    sources = [path for package in ("ptsmc_jax", "tuning") for path in (ROOT / package).rglob("*.py")]
+    code = "\n".join(path.read_text() for path in sources)
     code = re.sub(r'"\s+f?"', "", code)  # join the parts of long texts
     headings, found = re.compile(r"^\| message \|.*\n\| --- .*\n((?:\|.*\n)+)", re.M), []
     for rows in headings.findall((DOCS / "troubleshooting.md").read_text()):

@@ -42,11 +42,11 @@ class Telemetry(Table, frozen=True):
         ),
     ] = None
     wheel_torque: Annotated[
-        Columns | None, Meaning("instead of it, commanded torque of each wheel on the body about its axis")
+        Columns | None, Meaning("instead of torque: commanded torque of each wheel on the body about its axis")
     ] = None
     torque_unit: Annotated[Literal["N m", "mN m", "uN m"], Meaning("unit of the torque columns")] = "N m"
     wheel_speed: Annotated[
-        Columns | None, Meaning("instead of a torque, measured speed of each wheel relative to the body")
+        Columns | None, Meaning("instead of torque: measured speed of each wheel relative to the body")
     ] = None
     speed_unit: Annotated[Literal["rad/s", "rpm"], Meaning("unit of the speed columns")] = "rad/s"
     wheel_inertia: Annotated[
@@ -76,7 +76,7 @@ class Identify(Table, frozen=True):
     ] = None
     prior: Annotated[
         Literal["dispersion", "none"],
-        Meaning("[dispersion] is prior knowledge of the parameters that it disperses, or nothing is known before"),
+        Meaning('prior knowledge of the parameters: "dispersion" takes it from [dispersion], "none" assumes none'),
     ] = "dispersion"
     torque_walk: Annotated[
         NotNegative | None,
