@@ -25,7 +25,7 @@ from tests.helpers import SHORT, SHORT_CHAIN
 from tests.onboard.flights import PROFILE
 from tests.tree import ROOT, modules
 from tuning.cli.main import app
-from tuning.studies import campaign_folder, compare, mapping
+from tuning.studies import campaign_folder, campaign_theory, compare, mapping
 
 DOCS = ROOT / "docs"
 GENERATE = runpy.run_path(str(DOCS / "generate.py"))
@@ -85,7 +85,7 @@ def test_the_scenario_page_states_the_allowed_values_of_every_dispersion():
 
 def test_the_page_of_output_files_names_the_columns_and_files_that_the_code_writes():
     page = (DOCS / "output_files.md").read_text()
-    named = [*mapping.Cell.__dataclass_fields__, *compare.MODEL_ERRORS, store.JOURNAL, campaign_folder.THEORY]
+    named = [*mapping.Cell.__dataclass_fields__, *compare.MODEL_ERRORS, store.JOURNAL, campaign_theory.FILE]
     for name in {*named, campaign_folder.TABLE, *store.MADE_OF_RESULTS} - {"x", "y"}:
         assert f"`{name}`" in page or f"`window_error_{name}`" in page, name
 
