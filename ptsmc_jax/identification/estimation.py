@@ -29,9 +29,10 @@ from ptsmc_jax.scenario.tables import Scenario
 
 ROW_MULTIPLE = 256  # rows of a log are padded to a multiple of it, so that similar logs share compiled programs
 MAX_STEPS = 40  # largest number of steps of a local search
+MAX_DAMPING = 1e12  # largest damping of a step
 MAX_STEP_LENGTH = 3.0  # longest step of a local search, in sigmas of the prior
-NOISY_TOLERANCE = 0.3  # largest step that ends a search with noise on the acceleration, in sigmas of the estimate
-STEP_TOLERANCE = 1e-3  # largest step of a converged search, in sigmas of the estimate
+NOISY_TOLERANCE = 0.3  # largest next step that ends a search with noise on the acceleration, in sigmas of the estimate
+STEP_TOLERANCE = 1e-3  # largest next step of a converged search, in sigmas of the estimate
 ACCELERATION_NOISES = (0.3, 0.03, 0.003, 0.0003)  # noise in a search, relative to the usual acceleration [s^0.5]
 MAX_SCREENINGS = 4  # largest number of searches for outliers, each followed by a search for the parameters
 POOR_FIT = 1.5  # median normalised square of innovations above which a search begins with noise
@@ -390,34 +391,41 @@ class Search:
         Args:
             z: starting point (n,).
             logs: the logs, without outliers.
-            tolerance: length of a step that ends the search, in sigmas of the estimates.
+            tolerance: length of the undamped step that ends the search, in sigmas of the estimates.
         """
         exact = tolerance <= STEP_TOLERANCE or self._noise_is_free
         value, gradient, information, mean_square = start = self.derivatives(z, logs, exact=exact)
         if not _is_finite(start):  # such as an inertia that is too small for the modes, after a random start
             return SearchResult(z, -np.inf, np.zeros_like(information), np.inf, False, 0)
         damping, converged, steps = 0.0, False, 0
-        for steps in range(1, MAX_STEPS + 1):
-            sizes, directions = np.linalg.eigh(information)
-            directions = directions[:, sizes >= 1.0]  # other directions keep their prior
-            sizes = sizes[sizes >= 1.0]
-            while True:
-                step = directions @ ((directions.T @ gradient) / (sizes + damping))
-                step = step * min(1.0, MAX_STEP_LENGTH / max(float(np.linalg.norm(step)), 1e-300))
-                size = float(np.sqrt(step @ information @ step))
+        for steps in range(MAX_STEPS + 1):
+            converged = float(gradient @ _newton_step(gradient, information)) < tolerance**2
+            if converged or steps == MAX_STEPS:
+                break
+            while damping < MAX_DAMPING:
+                step = _newton_step(gradient, information, damping)
                 candidate = self.derivatives(z + step, logs, exact=exact)
+                if _is_finite(candidate) and candidate[0] < value:  # a narrow curved ridge: return to it
+                    step = step + _newton_step(candidate[1], candidate[2], damping)
+                    candidate = self.derivatives(z + step, logs, exact=exact)
                 if _is_finite(candidate) and candidate[0] >= value - 1e-9 * abs(value):
                     break
-                damping = max(10.0 * damping, float(np.min(sizes, initial=1.0)))
-                if damping > 1e12:
-                    return SearchResult(z, value, information, mean_square, size < tolerance, steps)
+                damping = max(10.0 * damping, 1.0)
+            else:
+                break
             z, damping = z + step, damping / 100.0
             value, gradient, information, mean_square = candidate
-            self.report(f"step {steps}: mean square of the innovations {mean_square:.4g}")
-            if size < tolerance:
-                converged = True
-                break
+            self.report(f"step {steps + 1}: mean square of the innovations {mean_square:.4g}")
         return SearchResult(z, value, information, mean_square, converged, steps)
+
+
+def _newton_step(gradient: np.ndarray, information: np.ndarray, damping: float = 0.0) -> np.ndarray:
+    """Return the damped step of Fisher scoring (n,). It is zero in directions that the data do not determine."""
+    sizes, directions = np.linalg.eigh(information)
+    is_determined = sizes >= 1.0
+    directions = directions[:, is_determined]
+    step = directions @ ((directions.T @ gradient) / (sizes[is_determined] + damping))
+    return step * min(1.0, MAX_STEP_LENGTH / max(float(np.linalg.norm(step)), 1e-300))
 
 
 def _is_finite(derivatives: tuple[float, np.ndarray, np.ndarray, float]) -> bool:

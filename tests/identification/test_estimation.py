@@ -114,6 +114,24 @@ def test_innovations_of_the_attitude_are_drawn_in_arcsec(identified):
     np.testing.assert_allclose(largest, np.nanmax(np.abs(innovations), axis=0) * factors, rtol=1e-12)
 
 
+def test_the_search_converges_if_a_log_hardly_determines_some_moments():
+    """A slew about one axis. An earlier version crept along a narrow curved ridge of the likelihood."""
+    loaded = scenario.from_tables({
+        "spacecraft": {"inertia": [0.05, 0.09, 0.11]},
+        "initial": {"rotvec_deg": [40.0, 0.0, 0.0]},
+        "controller": {"error": "multiplicative", "t_f": 60.0},
+        "loop": {"mode": "sampled", "period": 0.25, "t_end": 85.0},
+        "disturbance": {"kind": "none"},
+        "hardware": {"torque_lag": 0.05, "attitude_noise": 5e-5, "rate_noise": 1.4e-4, "rate_bias": 1e-4},
+        "wheels": {"kind": "axes"},
+    })  # fmt: skip
+    frame = explore.simulate(loaded).to_polars()
+    found = explore.identify(scenario.replace(loaded, spacecraft__inertia=[0.055, 0.085, 0.11]), frame)
+    assert found.is_identified, found.verdict
+    true = np.array([0.05, 0.0, 0.0, 0.09, 0.0, 0.11])
+    assert np.all(np.abs(found.estimate - true) < 3.5 * found.std)
+
+
 @pytest.mark.parametrize("samples", [11, 20, 60, 300])
 def test_the_verdict_on_short_logs_is_calibrated(samples):
     rng, wrong, detected = np.random.default_rng(samples), 0, 0
