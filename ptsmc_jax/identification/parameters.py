@@ -164,7 +164,8 @@ def build(scenario: Scenario, logs: Sequence[Measurements], names: Sequence[str]
         raise wrong("identify.free", names, f"a list with at least one parameter besides {GYRO_BIAS}")
     frequencies = [float(np.max(np.asarray(getattr(setup.plant, "frequency", [0.0]))))]
     fastest = max([*frequencies, *(term.largest_frequency() for term in scenario.terms)])
-    max_step = min(interval * 1.5, 0.2 / fastest if fastest > 0.0 else np.inf)
+    rate = max(_usual_rate(log) for log in logs)
+    max_step = min(interval * 1.5, 0.2 / max(fastest, 1e-12), 0.1 / max(rate, 1e-12))
     others = possible.keys() - {parameter.name for parameter in selected}
     dispersed = sorted(name for name in others if getattr(scenario.dispersion, name, None) is not None)
     return Problem(model, selected, max_step, GYRO_BIAS in names, tuple(dispersed))
@@ -226,6 +227,19 @@ def commanded_acceleration(model: Model, log: Measurements) -> float:
     x = plant.with_hidden_at_rest(jnp.asarray(log.readings["x"][0]) if "x" in log.readings else rest_state)
     driven, free = (plant.velocity(plant.rate(jnp.zeros(()), x, u, zero)) for u in (rms_command, zero))
     return float(jnp.max(jnp.abs(driven - free)))
+
+
+def _usual_rate(log: Measurements) -> float:
+    """Return the body rate that 95 % of the readings of a log do not exceed [rad/s]; 0 without an attitude or rate."""
+    readings = log.readings
+    if "rate" in readings:
+        return float(np.nanquantile(np.linalg.norm(readings["rate"], axis=1), 0.95))
+    if "attitude" not in readings:
+        return 0.0
+    has_attitude = ~np.isnan(readings["attitude"][:, 0])
+    q, t = readings["attitude"][has_attitude], log.t[has_attitude]
+    angles = 2.0 * np.arccos(np.minimum(np.abs(np.sum(q[1:] * q[:-1], axis=1)), 1.0))
+    return float(np.quantile(angles / np.diff(t), 0.95)) if q.shape[0] > 1 else 0.0
 
 
 def _estimate_noise(name: str, log: Measurements) -> np.ndarray:

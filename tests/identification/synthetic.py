@@ -26,7 +26,8 @@ def small(turn):
 
 def logs(
     rng, inertia, count=1, *, dt=0.1, rows=600, torque=1e-3, slews=3, wheels=False, scale=(1.0, 1.0, 1.0), lag=0.0,
-    star=5e-5, gyro=1.4e-4, bias=1e-4, walk=0.0, disturbance=lambda t: np.zeros(3),
+    star=5e-5, gyro=1.4e-4, bias=1e-4, walk=0.0, rate=(0.0, 0.0, 0.0),
+    disturbance=lambda t: np.zeros(3),
 ):  # fmt: skip
     """Return frames with the columns of `trajectory.csv`, and the true gyro bias of each at its end [rad/s].
 
@@ -49,6 +50,7 @@ def logs(
         gyro: 1 sigma of the gyro [rad/s].
         bias: 1 sigma of its bias [rad/s].
         walk: density of the walk of its bias [rad/s/sqrt(s)].
+        rate: body rate at the start [rad/s].
         disturbance: time [s] -> torque (3,) [N m].
     """
     t, inverse = dt * np.arange(rows), np.linalg.inv(inertia)
@@ -57,7 +59,7 @@ def logs(
     length = t[-1] / slews
     place = np.minimum((t / length).astype(int), slews - 1)
     command = torque * axes[:, place] * np.sin(2.0 * np.pi * (t - place * length) / length)[:, None]
-    q, w, h = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), np.zeros((count, 3)), np.zeros((count, 3))
+    q, w, h = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), np.tile(rate, (count, 1)), np.zeros((count, 3))
     v = np.zeros((count, 3))
     drift = bias * rng.standard_normal((count, 3))
     attitudes, rates, speeds = [], [], []
@@ -75,7 +77,7 @@ def logs(
             def torques(time, target=target, v=v, s=s):
                 return np.asarray(scale) * (target + (v - target) * np.exp(-time / lag) if lag else target)
 
-            def rate(state, time, at=t[k] + j * s, torques=torques):
+            def derive(state, time, at=t[k] + j * s, torques=torques):
                 q, w, h = state[:, :4], state[:, 4:7], state[:, 7:]
                 u = torques(time)
                 stored = h if wheels else 0.0 * h
@@ -84,10 +86,10 @@ def logs(
                 return np.concatenate([q_dot, push @ inverse.T, -u], 1)
 
             y = np.concatenate([q, w, h], 1)
-            k1 = rate(y, 0.0)
-            k2 = rate(y + s / 2 * k1, s / 2)
-            k3 = rate(y + s / 2 * k2, s / 2)
-            k4 = rate(y + s * k3, s)
+            k1 = derive(y, 0.0)
+            k2 = derive(y + s / 2 * k1, s / 2)
+            k3 = derive(y + s / 2 * k2, s / 2)
+            k4 = derive(y + s * k3, s)
             y = y + s / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
             q, w, h = y[:, :4] / np.linalg.norm(y[:, :4], axis=1, keepdims=True), y[:, 4:7], y[:, 7:]
             v = target + (v - target) * np.exp(-s / lag) if lag else target

@@ -132,6 +132,14 @@ def test_the_search_converges_if_a_log_hardly_determines_some_moments():
     assert np.all(np.abs(found.estimate - true) < 3.5 * found.std)
 
 
+def test_fast_rotation_is_integrated_accurately():
+    rng = np.random.default_rng(1)
+    (frame,), _ = synthetic.logs(rng, TRUE, dt=0.1, rows=300, wheels=True, lag=0.05, rate=(3.0, 2.0, -3.0))
+    found = explore.identify(satellite(), frame)
+    assert found.fits[0].is_white
+    assert np.all(np.abs(found.estimate - ENTRIES) < 3.5 * found.std)
+
+
 @pytest.mark.parametrize("samples", [11, 20, 60, 300])
 def test_the_verdict_on_short_logs_is_calibrated(samples):
     rng, wrong, detected = np.random.default_rng(samples), 0, 0
