@@ -67,7 +67,9 @@ def main() -> None:
         found = search.find_best(start, parameters.commanded_acceleration(problem.model, log), 3)
         seconds.append((time.perf_counter() - begun, time.process_time() - processor))
         good = search.reject_outliers(found.z, one)
-        not_white += not estimation.Fit(log, one[0], *search.run_filter(found.z, good)).is_white
+        not_white += not estimation.Fit(
+            log, one[0], *search.run_filter(found.z, good), acceleration_noise=found.acceleration_noise
+        ).is_white
         _, _, information, _ = search.derivatives(zero, [search.reject_outliers(zero, one)])
         at_truth = problem.derivatives(zero)
         bound = np.sqrt(np.diag(at_truth @ np.linalg.inv(information) @ at_truth.T))

@@ -34,7 +34,11 @@ MAX_STEP_LENGTH = 3.0  # longest step of a local search, in sigmas of the prior
 NOISY_TOLERANCE = 0.3  # largest next step that ends a search with noise on the acceleration, in sigmas of the estimate
 STEP_TOLERANCE = 1e-3  # largest next step of a converged search, in sigmas of the estimate
 ACCELERATION_NOISES = (0.3, 0.03, 0.003, 0.0003)  # noise in a search, relative to the usual acceleration [s^0.5]
+NOISE_GAIN = 8.0  # smallest gain of the log-likelihood for which noise on the acceleration is kept: 4 sigma
 MAX_SCREENINGS = 4  # largest number of searches for outliers, each followed by a search for the parameters
+MAX_OUTLIER_FRACTION = 0.05  # largest fraction of the readings of a component that are rejected as outliers
+MIN_OUTLIERS = 3  # number of outliers of a component that are allowed in a short log
+GATE_GROWTHS = (*np.logspace(0.0, 8.0, 9), np.inf)  # factors of the limit of outliers, if it rejects more readings
 POOR_FIT = 1.5  # median normalised square of innovations above which a search begins with noise
 LAGS = 25  # number of lags of the autocorrelation
 MAX_AUTOCORRELATION = 0.05  # largest autocorrelation that counts as white in a long log
@@ -44,6 +48,12 @@ MAX_DISTANCE = 3.0  # largest distance of the most likely parameters of a valida
 CONFIDENCE = 0.95  # of the intervals of the estimates
 MIN_COMPONENT = 0.3  # smallest component of an undetermined direction whose parameter is named
 PreparedLog = tuple[Rows, LogKind]  # a log for the filter
+
+
+def _mean_square_range(count: int) -> tuple[float, float]:
+    """Return the range of the mean square of `count` innovations of a good fit [-]."""
+    spread = MISFIT_SIGMAS * np.sqrt(2.0 / max(count, 1))  # of the mean square of normal random numbers
+    return min(MEAN_SQUARE_RANGE[0], 1.0 - spread), max(MEAN_SQUARE_RANGE[1], 1.0 + spread)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +70,7 @@ class Fit:
     innovations: Innovations  # arrays (rows - 1, components)
     track: FilterState  # estimates at each row but the first
     adjusted: Innovations | None = None
+    acceleration_noise: float = 0.0  # of the filter [rad/s^1.5]; above 0 if the model does not explain the logs
     distance: float = 0.0  # distance of the adjusted parameters from the estimates, RMS in sigmas of the estimates
 
     @property
@@ -87,6 +98,19 @@ class Fit:
         """Number of readings that are used, each component counted."""
         return int(np.sum(self.innovations.accepted))
 
+    @property
+    def variance_factor(self) -> float:
+        """Ratio of the variance of the estimates to their Cramer-Rao bound for innovations like these [-], at least 1.
+
+        The estimates add up innovations in time. The variance of a sum of innovations is the sum of their
+        autocovariance over all lags (Morelli and Klein, JGCD 20(1), 1997). The component with the largest
+        ratio counts. The ratio is 1 if the model explains the log.
+        """
+        if self.is_white:
+            return 1.0
+        squares = np.nansum(self.whitened**2, axis=0) / np.maximum(np.sum(np.isfinite(self.whitened), axis=0), 1)
+        return max(1.0, float(np.max(squares * (1.0 + 2.0 * np.sum(self.autocorrelation(), axis=0)))))
+
     def autocorrelation(self) -> np.ndarray:
         """Return the autocorrelation (LAGS, components) [-] of the whitened innovations at the lags 1, 2, ..
 
@@ -105,14 +129,14 @@ class Fit:
     def is_white(self) -> bool:
         """Whether the innovations fit their variance and are uncorrelated in time.
 
-        The adjusted parameters of a validation log must also be near the estimates, see `MAX_DISTANCE`. About 1 % of
-        logs fail even with a correct model, because LAGS autocorrelations of each component are tested.
+        The filter must have no noise on the acceleration. The adjusted parameters of a validation log must also be near
+        the estimates, see `MAX_DISTANCE`. About 1 % of logs fail even with a correct model, because LAGS
+        autocorrelations of each component are tested.
         """
         readings = np.maximum(np.sum(np.isfinite(self.whitened), axis=0), 1)
         bound = np.maximum(MAX_AUTOCORRELATION, MISFIT_SIGMAS / np.sqrt(readings))
-        spread = MISFIT_SIGMAS * np.sqrt(2.0 / np.sum(readings))  # of the mean square of normal random numbers
-        low, high = MEAN_SQUARE_RANGE
-        is_consistent = min(low, 1.0 - spread) < self.mean_square < max(high, 1.0 + spread)
+        low, high = _mean_square_range(int(np.sum(readings)))
+        is_consistent = low < self.mean_square < high and self.acceleration_noise == 0.0
         return is_consistent and self.distance < MAX_DISTANCE and bool(np.all(np.abs(self.autocorrelation()) < bound))
 
 
@@ -129,6 +153,7 @@ class Identification:
     covariance: np.ndarray  # covariance of the estimated numbers (k, k)
     undetermined: list[str]  # sentences on combinations that the data do not determine
     is_determined: bool  # whether data and prior knowledge together determine every parameter
+    variance_factor: float  # ratio of the covariance to the Cramer-Rao bound, see `Fit.variance_factor`
     fits: list[Fit]  # fits of the logs
     validation: list[Fit]  # fits of the validation logs
     converged: bool  # whether the search that ended at z converged
@@ -195,7 +220,12 @@ def estimate_parameters(
         if (set(log.readings), _log_kind(log)) != (set(first.readings), _log_kind(first)):
             raise ScenarioError(f"{log.name} has other readings than {first.name}, but all logs must have the same")
     problem, table = parameters.build(loaded, logs, free), loaded.identify or Identify()
-    search = Search(problem, [prepare_log(problem, log) for log in logs], innovation_gate(table.outliers), report)
+    search = Search(
+        problem,
+        [prepare_log(problem, log) for log in logs],
+        innovation_gate(table.outliers, 1 if "x" in first.readings else 3),
+        report,
+    )
     largest_acceleration = max(parameters.commanded_acceleration(problem.model, log) for log in logs)
     best = search.find_best(np.zeros(problem.size), largest_acceleration, table.starts)
     return _build_result(loaded, problem, search, best, logs, validation_logs)
@@ -210,9 +240,14 @@ def prepare_log(problem: Problem, log: Measurements) -> PreparedLog:
     return filtering.make_rows(log, problem.max_step, ROW_MULTIPLE), _log_kind(log)
 
 
-def innovation_gate(rate: float) -> float:
-    """Return the mean normalised square [-] that correct readings exceed with this probability, infinity for 0."""
-    return float(stats.chi2.isf(rate, 3) / 3.0) if rate > 0.0 else np.inf
+def innovation_gate(rate: float, size: int = 3) -> float:
+    """Return the mean normalised square [-] that a correct group of readings exceeds with this probability.
+
+    Args:
+        rate: the probability; the limit is infinite for 0.
+        size: number of readings of a group, which are rejected together.
+    """
+    return float(stats.chi2.isf(rate, size) / size) if rate > 0.0 else np.inf
 
 
 class SearchResult(NamedTuple):
@@ -224,6 +259,7 @@ class SearchResult(NamedTuple):
     mean_square: float  # of the innovations, relative to their variance
     converged: bool
     steps: int
+    acceleration_noise: float  # of the filter [rad/s^1.5]
 
 
 class Search:
@@ -234,9 +270,10 @@ class Search:
         self.problem, self.logs, self.gate, self.report = problem, list(logs), gate, report
         self.prior_weight = problem.has_prior().astype(float)
         self._noise_is_free = any(parameter.name.endswith("_noise") for parameter in problem.parameters)
-        self.acceleration_noise = jnp.zeros(())
+        self.acceleration_noise = 0.0  # of the filter [rad/s^1.5]
         self._jitted_filter = jax.jit(
-            lambda z, rows, kind: filtering.run_filter(problem.model_at(z), rows, kind), static_argnames="kind"
+            lambda z, noise, rows, kind: filtering.run_filter(self._model_at(z, noise), rows, kind),
+            static_argnames="kind",
         )
         self._jitted_innovations = jax.jit(
             lambda z, noise, rows, gate, kind: filtering.run_filter(
@@ -285,12 +322,13 @@ class Search:
     def run_filter(self, z: np.ndarray, log: PreparedLog) -> tuple[Innovations, FilterState]:
         """Return innovations and estimates of the filter for a log, as NumPy arrays."""
         rows, kind = log
-        return jax.tree.map(np.asarray, self._jitted_filter(jnp.asarray(z), _to_jax(rows), kind=kind))
+        computed = self._jitted_filter(jnp.asarray(z), jnp.asarray(self.acceleration_noise), _to_jax(rows), kind=kind)
+        return jax.tree.map(np.asarray, computed)
 
     def innovations(self, z: np.ndarray, log: PreparedLog, gate: float = np.inf) -> Innovations:
         """Return the innovations of a log, as NumPy arrays."""
         rows, kind = log
-        noise = self.acceleration_noise
+        noise = jnp.asarray(self.acceleration_noise)
         computed = self._jitted_innovations(jnp.asarray(z), noise, _to_jax(rows), gate, kind=kind)
         return jax.tree.map(np.asarray, computed)
 
@@ -309,7 +347,7 @@ class Search:
             Log-likelihood, its gradient (n,), and the information (n, n) of logs and prior. Then the mean square of the
             innovations relative to their 1 sigma, averaged over the logs.
         """
-        weight, noise, squares = self.prior_weight, self.acceleration_noise, []
+        weight, noise, squares = self.prior_weight, jnp.asarray(self.acceleration_noise), []
         value, gradient, information = -0.5 * float(weight @ z**2), -weight * z, np.diag(weight)
         for rows, kind in logs:
             terms = self._jitted_derivatives(jnp.asarray(z), noise, _to_jax(rows), kind, exact)
@@ -328,32 +366,51 @@ class Search:
         """
         best, draws = self.search_locally(z, acceleration), np.random.default_rng(0)
         for k in range(1, max_starts):
-            if best.mean_square < MEAN_SQUARE_RANGE[1]:
+            if best.acceleration_noise == 0.0 and best.mean_square < self.largest_mean_square:
                 break
             self.report(f"the fit is poor; starting point {k + 1}")
-            other = self.search_locally(draws.standard_normal(self.problem.size), acceleration)
-            best = max(best, other, key=lambda result: result.log_likelihood)
+            best = _more_likely(best, self.search_locally(draws.standard_normal(self.problem.size), acceleration))
+        self.acceleration_noise = best.acceleration_noise
         return best
+
+    @property
+    def largest_mean_square(self) -> float:
+        """The largest mean square of the innovations of a good fit [-]."""
+        return _mean_square_range(sum(int(np.sum(rows.valid[1:])) for rows, _ in self.logs))[1]
 
     def search_locally(self, z: np.ndarray, acceleration: float) -> SearchResult:
         """Return the result of the local search from coordinates (n,), with outliers rejected.
 
         A model that is far off predicts a long log badly, and its likelihood has many maxima. If the fit is poor, the
-        search therefore begins with noise on the acceleration, so that the filter follows the log, and reduces it.
+        search therefore begins with noise on the acceleration, so that the filter follows the log, and reduces it. A
+        model that does not explain the log keeps the noise that makes it likely, so that the information allows for the
+        errors of the model.
 
         Args:
             z: starting point.
             acceleration: usual acceleration in the logs, which scales the noise [rad/s^2]; 0: no noise is added.
         """
-        if acceleration > 0.0 and max(self._relative_median(self.innovations(z, log)) for log in self.logs) > POOR_FIT:
-            for factor in ACCELERATION_NOISES:
-                self.acceleration_noise = jnp.asarray(factor * acceleration)
-                self.report(f"the fit is poor: a filter with noise of {float(self.acceleration_noise):.2g} rad/s^1.5")
-                z = self._screen_and_maximise(z, 1, NOISY_TOLERANCE).z
-            self.acceleration_noise = jnp.zeros(())
-        return self._screen_and_maximise(z, MAX_SCREENINGS, STEP_TOLERANCE)
+        self.acceleration_noise = 0.0
+        if acceleration == 0.0 or max(self._relative_median(self.innovations(z, log)) for log in self.logs) < POOR_FIT:
+            result = self._screen_and_maximise(z)
+            if acceleration == 0.0 or result.mean_square < self.largest_mean_square:
+                return result
+        accepted, highest = None, -np.inf
+        for factor in (*ACCELERATION_NOISES, 0.0):
+            self.acceleration_noise = factor * acceleration
+            self.report(f"the fit is poor: acceleration noise {self.acceleration_noise:.2g} rad/s^1.5 in the filter")
+            result = self._screen_and_maximise(z, 1, NOISY_TOLERANCE) if factor else self._screen_and_maximise(z)
+            highest = max(highest, result.log_likelihood)
+            if accepted is not None and result.log_likelihood < highest - NOISE_GAIN:
+                self.acceleration_noise = accepted.acceleration_noise
+                return self._screen_and_maximise(accepted.z)
+            z, accepted = result.z, result
+        assert accepted is not None
+        return accepted
 
-    def _screen_and_maximise(self, z: np.ndarray, screenings: int, tolerance: float) -> SearchResult:
+    def _screen_and_maximise(
+        self, z: np.ndarray, screenings: int = MAX_SCREENINGS, tolerance: float = STEP_TOLERANCE
+    ) -> SearchResult:
         previous_masks, result = None, None
         for _ in range(screenings):
             logs = [self.reject_outliers(z, log) for log in self.logs]
@@ -374,16 +431,17 @@ class Search:
     def reject_outliers(self, z: np.ndarray, log: PreparedLog) -> PreparedLog:
         """Return the log without its outliers at these coordinates.
 
-        The limit is relative to the median of the squares, so that a poor model does not reject correct readings.
+        The limit grows until few readings of each component exceed it, so that a poor model does not reject correct
+        readings.
         """
-        if not np.isfinite(self.gate):
-            return log
-        scale = 1.0
-        for gate in (np.inf, self.gate):
-            innovations = self.innovations(z, log, gate * scale)
-            scale = max(scale, self._relative_median(innovations))
         rows, kind = log
-        return rows._replace(valid=np.concatenate([rows.valid[:1], innovations.accepted])), kind
+        accepted = valid = rows.valid[1:]
+        largest_count = np.maximum(MIN_OUTLIERS, MAX_OUTLIER_FRACTION * np.sum(valid, axis=0))
+        for growth in GATE_GROWTHS:
+            accepted = self.innovations(z, log, growth * self.gate).accepted
+            if np.all(np.sum(valid & ~accepted, axis=0) <= largest_count):
+                break
+        return rows._replace(valid=np.concatenate([rows.valid[:1], accepted])), kind
 
     def maximise_likelihood(self, z: np.ndarray, logs: Sequence[PreparedLog], tolerance: float) -> SearchResult:
         """Return the result of a local search from z for the most likely parameters of these logs and the prior.
@@ -396,7 +454,7 @@ class Search:
         exact = tolerance <= STEP_TOLERANCE or self._noise_is_free
         value, gradient, information, mean_square = start = self.derivatives(z, logs, exact=exact)
         if not _is_finite(start):  # such as an inertia that is too small for the modes, after a random start
-            return SearchResult(z, -np.inf, np.zeros_like(information), np.inf, False, 0)
+            return SearchResult(z, -np.inf, np.zeros_like(information), np.inf, False, 0, self.acceleration_noise)
         damping, converged, steps = 0.0, False, 0
         for steps in range(MAX_STEPS + 1):
             converged = float(gradient @ _newton_step(gradient, information)) < tolerance**2
@@ -416,7 +474,7 @@ class Search:
             z, damping = z + step, damping / 100.0
             value, gradient, information, mean_square = candidate
             self.report(f"step {steps + 1}: mean square of the innovations {mean_square:.4g}")
-        return SearchResult(z, value, information, mean_square, converged, steps)
+        return SearchResult(z, value, information, mean_square, converged, steps, self.acceleration_noise)
 
 
 def _newton_step(gradient: np.ndarray, information: np.ndarray, damping: float = 0.0) -> np.ndarray:
@@ -426,6 +484,10 @@ def _newton_step(gradient: np.ndarray, information: np.ndarray, damping: float =
     directions = directions[:, is_determined]
     step = directions @ ((directions.T @ gradient) / (sizes[is_determined] + damping))
     return step * min(1.0, MAX_STEP_LENGTH / max(float(np.linalg.norm(step)), 1e-300))
+
+
+def _more_likely(*results: SearchResult) -> SearchResult:
+    return max(results, key=lambda result: result.log_likelihood)
 
 
 def _is_finite(derivatives: tuple[float, np.ndarray, np.ndarray, float]) -> bool:
@@ -492,14 +554,14 @@ def _build_result(
     validation_logs: Sequence[Measurements],
 ) -> Identification:
     z, zero, has_prior = best.z, np.zeros(problem.size), problem.has_prior()
-    z_covariance, by_z, by_start = covariance(best.information), problem.derivatives(z), problem.derivatives(zero)
+    by_z, by_start = problem.derivatives(z), problem.derivatives(zero)
     prior_std = np.sqrt(np.sum(by_start[:, has_prior] ** 2, axis=1))
     prior_std = np.where(np.any(by_start[:, ~has_prior] != 0.0, axis=1) | (prior_std == 0.0), np.inf, prior_std)
 
     def fit_log(log: Measurements, is_validation: bool = False) -> Fit:
         prepared = prepare_log(problem, log)
         screened = search.reject_outliers(z, prepared)
-        fit = Fit(log, prepared[0], *search.run_filter(z, screened))
+        fit = Fit(log, prepared[0], *search.run_filter(z, screened), acceleration_noise=best.acceleration_noise)
         if not is_validation:
             return fit
         _, gradient, information, _ = search.derivatives(z, [screened])
@@ -508,6 +570,9 @@ def _build_result(
         distance = float(np.sqrt(step @ prior_information @ step / step.size))
         return replace(fit, adjusted=search.innovations(z + step, screened), distance=distance)
 
+    fits = [fit_log(log) for log in logs]
+    variance_factor = max(fit.variance_factor for fit in fits)
+    z_covariance = covariance(best.information / variance_factor)
     return Identification(
         scenario=loaded,
         problem=problem,
@@ -518,7 +583,8 @@ def _build_result(
         covariance=by_z @ z_covariance @ by_z.T,
         undetermined=describe_undetermined(problem, best.information - np.diag(search.prior_weight), by_start),
         is_determined=bool(np.min(np.linalg.eigvalsh(best.information)) >= 1.0),
-        fits=[fit_log(log) for log in logs],
+        variance_factor=variance_factor,
+        fits=fits,
         validation=[fit_log(log, is_validation=True) for log in validation_logs],
         converged=best.converged,
         steps=best.steps,

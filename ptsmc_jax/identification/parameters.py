@@ -146,11 +146,13 @@ def build(scenario: Scenario, logs: Sequence[Measurements], names: Sequence[str]
     table = scenario.identify or Identify()
     has_gyro = "rate" in logs[0].readings
     usual_names = ("inertia", GYRO_BIAS)[: 1 + has_gyro] if scenario.plant.kind == "spacecraft" else ("actuator_scale",)
-    names = tuple(names or table.free or usual_names)
     interval = float(np.median(np.diff(logs[0].t)))
-    model, unknown_noises = _build_model(scenario, table, setup, logs, GYRO_BIAS in names)
+    names = tuple(names or table.free or ())
+    with_bias = GYRO_BIAS in (names or usual_names)
+    model, unknown_noises = _build_model(scenario, table, setup, logs, with_bias)
     prior = scenario.dispersion if table.prior == "dispersion" else None
     possible = _possible_parameters(scenario, model, logs, interval, prior)
+    names = names or (*usual_names, *(name for name in possible if getattr(prior, name, None) is not None))
     selected = []
     for name in dict.fromkeys((*names, *unknown_noises)):
         if name in possible:
@@ -168,7 +170,7 @@ def build(scenario: Scenario, logs: Sequence[Measurements], names: Sequence[str]
     max_step = min(interval * 1.5, 0.2 / max(fastest, 1e-12), 0.1 / max(rate, 1e-12))
     others = possible.keys() - {parameter.name for parameter in selected}
     dispersed = sorted(name for name in others if getattr(scenario.dispersion, name, None) is not None)
-    return Problem(model, selected, max_step, GYRO_BIAS in names, tuple(dispersed))
+    return Problem(model, selected, max_step, with_bias, tuple(dispersed))
 
 
 def _build_model(

@@ -149,6 +149,8 @@ def summary(identification: Identification) -> dict[str, Any]:
         "converged": identification.converged,
         "steps": identification.steps,
         "log_likelihood": identification.log_likelihood,
+        "acceleration_noise": max(fit.acceleration_noise for fit in identification.fits),
+        "variance_factor": identification.variance_factor,
         "parameters": list(identification.table().iter_rows(named=True)),
         "undetermined": identification.undetermined,
         "gyro_bias": [
@@ -207,6 +209,11 @@ def verdict(identification: Identification) -> list[str]:
             details += f", for parameters {fit.distance:.2g} sigma from the estimates"
         if fit.is_white:
             lines.append(f"the model explains {name}: its innovations are white, with {details}")
+        elif fit.acceleration_noise > 0.0:
+            lines.append(
+                f"the model does NOT explain {name}: estimates and intervals allow for a random acceleration; "
+                f"{advice}, or add torque_walk to [identify]"
+            )
         else:
             largest = float(np.max(np.abs(fit.autocorrelation())))
             lines.append(
@@ -215,6 +222,9 @@ def verdict(identification: Identification) -> list[str]:
             )
         if fit.outlier_count:
             lines.append(f"{fit.outlier_count} readings of {name} are outliers and were not used")
+    if identification.variance_factor > 1.0:
+        widening = float(np.sqrt(identification.variance_factor))
+        lines.append(f"all intervals are {widening:.3g} times as wide as for white innovations")
     if not identification.converged:
         lines.append("the search did NOT converge; its estimates are preliminary")
     return [*lines, *identification.undetermined]

@@ -72,7 +72,10 @@ class Identify(Table, frozen=True):
 
     free: Annotated[
         Annotated[tuple[Column, ...], Meta(min_length=1, description="a list of names of parameters")] | None,
-        Meaning("parameters to estimate; default: inertia and gyro_bias, of other plants actuator_scale"),
+        Meaning(
+            "parameters to estimate; default: inertia and gyro_bias, of other plants actuator_scale, and those that "
+            '[dispersion] varies unless prior is "none"'
+        ),
     ] = None
     prior: Annotated[
         Literal["dispersion", "none"],

@@ -60,6 +60,7 @@ def test_a_simulated_run_gives_its_parameters_and_a_page(command, logged):
     scale = summary["parameters"][0]
     assert abs(scale["estimate"] - 1.25) < 3.5 * scale["std"] < 0.02
     assert summary["validation"][0]["white"]
+    assert summary["logs"][0]["outliers"] == 0
     identified = scenario.read(folder / "identified.toml")
     assert identified.hardware.actuator_scale == (scale["estimate"],)
     assert identified.dispersion.actuator_scale.std == pytest.approx(scale["std"] / scale["estimate"])

@@ -114,6 +114,46 @@ def test_innovations_of_the_attitude_are_drawn_in_arcsec(identified):
     np.testing.assert_allclose(largest, np.nanmax(np.abs(innovations), axis=0) * factors, rtol=1e-12)
 
 
+TORQUE, FREQUENCY, PHASES = 5e-6, 0.01, np.array([2.1, -0.6, 0.4])
+DISPERSED = {
+    "disturbance": {"kind": "sinusoid", "amplitude": 3 * [TORQUE], "frequency": 3 * [FREQUENCY]},
+    "dispersion": {"disturbance_phase": {"kind": "uniform"}},
+}
+
+
+@pytest.fixture(scope="module")
+def disturbed():
+    """A log with a slow sinusoidal torque, whose phases are not those of the scenario."""
+    return flight(
+        np.random.default_rng(7), disturbance=lambda t: TORQUE * np.sin(FREQUENCY * t + PHASES)
+    )[0]  # fmt: skip
+
+
+def test_a_wrong_model_does_not_reject_correct_readings_and_has_wide_intervals(disturbed):
+    """An earlier version rejected the attitudes as outliers, and its errors were up to 75 standard deviations."""
+    found = explore.identify(satellite(**DISPERSED), disturbed)
+    assert not found.is_identified
+    assert found.fits[0].outlier_count == 0
+    assert np.all(np.abs(found.estimate - ENTRIES) < 3.5 * found.std)
+    assert "free disturbance_phase, which [dispersion] varies" in found.verdict[0]
+
+
+def test_intervals_are_wider_if_innovations_are_not_white():
+    rng, count = np.random.default_rng(0), 2000
+    noise = rng.standard_normal((count + 9, 3))
+    coloured = sum(noise[k : count + k] for k in range(10)) / np.sqrt(10.0)  # variance 1; sums have variance 10
+    t, there = np.arange(count + 1.0), np.ones((count + 1, 3), bool)
+    log = telemetry.Measurements("a log", t, {}, np.zeros((count + 1, 3)))
+    rows = filtering.Rows(t, np.ones(count + 1), {}, there, log.command, np.zeros(3), np.arange(count + 1))
+    none = filtering.FilterState(None, None, None, None, None)
+    factors = [
+        estimation.Fit(log, rows, filtering.Innovations(value, np.ones_like(value), there[1:]), none).variance_factor
+        for value in (noise[:count], coloured)
+    ]
+    assert factors[0] == 1.0
+    assert 7.0 < factors[1] < 15.0  # the largest of three
+
+
 def test_the_search_converges_if_a_log_hardly_determines_some_moments():
     """A slew about one axis. An earlier version crept along a narrow curved ridge of the likelihood."""
     loaded = scenario.from_tables({
