@@ -35,6 +35,7 @@ NOISY_TOLERANCE = 0.3  # largest next step that ends a search with noise on the 
 STEP_TOLERANCE = 1e-3  # largest next step of a converged search, in sigmas of the estimate
 ACCELERATION_NOISES = (0.3, 0.03, 0.003, 0.0003)  # noise in a search, relative to the usual acceleration [s^0.5]
 NOISE_GAIN = 8.0  # smallest gain of the log-likelihood for which noise on the acceleration is kept: 4 sigma
+MIRROR_GAIN = 8.0  # smallest gain of the log-likelihood that tells a phase from its mirrored value
 MAX_SCREENINGS = 4  # largest number of searches for outliers, each followed by a search for the parameters
 MAX_OUTLIER_FRACTION = 0.05  # largest fraction of the readings of a component that are rejected as outliers
 MIN_OUTLIERS = 3  # number of outliers of a component that are allowed in a short log
@@ -271,6 +272,7 @@ class Search:
         self.prior_weight = problem.has_prior().astype(float)
         self._noise_is_free = any(parameter.name.endswith("_noise") for parameter in problem.parameters)
         self.acceleration_noise = 0.0  # of the filter [rad/s^1.5]
+        self.ambiguities: list[str] = []  # a sentence for each phase whose mirrored value is about as likely
         self._jitted_filter = jax.jit(
             lambda z, noise, rows, kind: filtering.run_filter(self._model_at(z, noise), rows, kind),
             static_argnames="kind",
@@ -364,13 +366,35 @@ class Search:
             acceleration: see `search_locally`.
             max_starts: largest number of starting points.
         """
-        best, draws = self.search_locally(z, acceleration), np.random.default_rng(0)
+        best, draws = self._mirror_phases(self.search_locally(z, acceleration)), np.random.default_rng(0)
         for k in range(1, max_starts):
             if best.acceleration_noise == 0.0 and best.mean_square < self.largest_mean_square:
                 break
             self.report(f"the fit is poor; starting point {k + 1}")
             best = _more_likely(best, self.search_locally(draws.standard_normal(self.problem.size), acceleration))
         self.acceleration_noise = best.acceleration_noise
+        return best
+
+    def _mirror_phases(self, best: SearchResult) -> SearchResult:
+        """Return the best of a search result and of searches from its mirrored phases, see `Problem.mirror_phase`."""
+        phases = self.problem.phases
+        while phases:
+            self.report("the mirrored phases of the disturbance")
+            others = [self._screen_and_maximise(self.problem.mirror_phase(best.z, k)) for k in phases]
+            if _more_likely(*others).log_likelihood < best.log_likelihood + 1.0:
+                self.ambiguities = [
+                    f"the data do not tell {self.problem.labels[k]} from its mirrored value"
+                    for k, other in zip(phases, others, strict=True)
+                    if other.log_likelihood > best.log_likelihood - MIRROR_GAIN
+                    and abs(parameters.wrap_angle((self.problem.numbers(other.z) - self.problem.numbers(best.z))[k]))
+                    > 0.1
+                ]
+                break
+            best = _more_likely(*others)
+            if self.acceleration_noise > 0.0:  # the phase may have been the only error of the model
+                self.acceleration_noise = 0.0
+                best = _more_likely(best, self._screen_and_maximise(best.z))
+                self.acceleration_noise = best.acceleration_noise
         return best
 
     @property
@@ -581,8 +605,11 @@ def _build_result(
         prior_std=prior_std,
         estimate=problem.numbers(z),
         covariance=by_z @ z_covariance @ by_z.T,
-        undetermined=describe_undetermined(problem, best.information - np.diag(search.prior_weight), by_start),
-        is_determined=bool(np.min(np.linalg.eigvalsh(best.information)) >= 1.0),
+        undetermined=[
+            *describe_undetermined(problem, best.information - np.diag(search.prior_weight), by_start),
+            *search.ambiguities,
+        ],
+        is_determined=bool(np.min(np.linalg.eigvalsh(best.information)) >= 1.0) and not search.ambiguities,
         variance_factor=variance_factor,
         fits=fits,
         validation=[fit_log(log, is_validation=True) for log in validation_logs],

@@ -35,6 +35,7 @@ from ptsmc_jax.simulation.assembly import Parts
 
 # parameters of sensors that only [hardware] has, and that [[sensors]] replaces
 HARDWARE_PARAMETERS = ("attitude_noise", "rate_noise", "gyro_scale", "star_tracker_misalignment")
+PHASE = "disturbance_phase"
 GYRO_BIAS = "gyro_bias"  # a state of the filter, not a constant
 NOISE_UNITS = {"attitude": "rad", "rate": "rad/s"}
 UNKNOWN_BIAS = 0.02  # 1 sigma of an unknown gyro bias [rad/s]
@@ -126,9 +127,27 @@ class Problem:
         """The unit of each number."""
         return [parameter.unit for parameter in self.parameters for _ in parameter.labels]
 
+    @property
+    def phases(self) -> list[int]:
+        """The indices of the phases of disturbances among the numbers."""
+        return [k for k, label in enumerate(self.labels) if label.startswith(PHASE)]
+
+    def mirror_phase(self, z: np.ndarray, k: int) -> np.ndarray:
+        """Return coordinates (n,) with number k, a phase p, mirrored to pi - p.
+
+        A slow sinusoid has almost the same value at both phases, and the likelihood has a maximum near each of them.
+        """
+        by_phase = self.derivatives(z)[k]
+        return z + wrap_angle(np.pi - 2.0 * self.numbers(z)[k]) * by_phase / (by_phase @ by_phase)
+
     def has_prior(self) -> np.ndarray:
         """Return whether each coordinate has prior knowledge, (n,) bool."""
         return np.concatenate([np.full(parameter.size, parameter.has_prior) for parameter in self.parameters])
+
+
+def wrap_angle(angle: float) -> float:
+    """Return an angle in [-pi, pi) [rad]."""
+    return float((angle + np.pi) % (2.0 * np.pi) - np.pi)
 
 
 def build(scenario: Scenario, logs: Sequence[Measurements], names: Sequence[str] | None = None) -> Problem:
@@ -281,7 +300,9 @@ def _possible_parameters(
     def prior_sigma(name: str, count: int) -> tuple[np.ndarray, bool]:
         """Return the 1 sigma of each number, (count,), and whether [dispersion] gives it."""
         table: Any = getattr(prior, name, None)
-        if not hasattr(table, "widths"):  # no dispersion is given, or a phase is uniform over the circle
+        if name == PHASE and table is not None:  # uniform over the circle
+            return np.full(count, np.pi / np.sqrt(3.0)), True
+        if table is None:
             return np.full(count, usual_sigma["noise" if name.endswith("_noise") else name]), False
         sigmas = table.widths(count) * (1.0 if table.kind.endswith("normal") else 1.0 / np.sqrt(3.0))
         return np.maximum(sigmas, 1e-9), True

@@ -11,6 +11,7 @@ from ptsmc_jax.identification import parameters
 from ptsmc_jax.identification.estimation import LAGS, Fit, Identification
 from ptsmc_jax.scenario import parsing, reading
 from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.signals import disturbances
 
 MAX_STD = 0.3  # largest 1 sigma of a relative dispersion in a scenario
 
@@ -74,7 +75,7 @@ def _write_estimate(
             sizes = values if key == "frequency" else np.repeat(np.linalg.norm(modes, axis=1), 3)
             dispersion[name] = _relative_dispersion(std, sizes)
     elif name.startswith("disturbance_"):
-        _write_disturbance(tables, dispersion, name, numbers, std, relative)
+        _write_disturbance(tables, dispersion, name, numbers, std, relative, identification)
     if hardware:
         tables["hardware"] = hardware
 
@@ -91,6 +92,7 @@ def _write_disturbance(
     numbers: list[float],
     std: np.ndarray,
     relative: dict[str, object],
+    identification: Identification,
 ) -> None:
     """Write the estimate of a disturbance into [disturbance], and its spread into [dispersion].
 
@@ -101,6 +103,7 @@ def _write_disturbance(
         numbers: the estimates.
         std: 1 sigma of the estimates.
         relative: dispersion of an amplitude, a table with a kind.
+        identification: its scenario has the number of phases and amplitudes of each term.
     """
     table = dict(tables.get("disturbance", {}))
     terms = [dict(term) for term in table.get("terms", [])] or [table]
@@ -108,15 +111,20 @@ def _write_disturbance(
         terms = [*(term for term in terms if term.get("kind") != "none"), {"kind": "constant", "amplitude": numbers}]
         dispersion[name] = {"kind": "normal", "std": float(np.max(std))}
     else:
-        key, begin = name.removeprefix("disturbance_"), 0
-        for term in terms:
-            if key in term:
-                size = len(term[key]) if isinstance(term[key], list) else 1
-                term[key] = numbers[begin : begin + size] if isinstance(term[key], list) else numbers[begin]
-                begin += size
-        if key == "amplitude":
+        quantity: Any = name.removeprefix("disturbance_")
+        begin = 0
+        scenario: Any = identification.scenario
+        inertia = getattr(identification.problem.model.plant, "inertia", None)
+        for term, part in zip(terms, scenario.terms, strict=False):  # an estimated bias may follow
+            signal: Any = part.build(inertia, scenario)
+            size = disturbances.values(signal, quantity).size
+            if size:  # the key may be absent, with a default value
+                is_list = size > 1 or isinstance(term.get(quantity), list)
+                term[quantity] = numbers[begin : begin + size] if is_list else numbers[begin]
+            begin += size
+        if quantity == "amplitude":
             dispersion[name] = relative
-        else:
+        elif np.max(std) < 1.0:
             dispersion.pop(name, None)  # the phase is no longer random
     tables["disturbance"] = terms[0] if len(terms) == 1 else {"kind": "sum", "terms": terms}
 

@@ -129,6 +129,30 @@ def disturbed():
     )[0]  # fmt: skip
 
 
+def test_dispersed_phases_are_estimated_by_default_and_not_confused_with_their_mirror_images(disturbed):
+    """An earlier version estimated the inertia only, with errors of 60 %, or ended near the phase pi - 2.1."""
+    found = explore.identify(satellite(identify={}, **DISPERSED), disturbed)
+    assert found.is_identified, found.verdict
+    first = found.problem.labels.index("disturbance_phase_1")
+    errors = found.estimate - np.concatenate([ENTRIES, PHASES])
+    errors[first:] = (errors[first:] + np.pi) % (2.0 * np.pi) - np.pi
+    assert np.all(np.abs(errors) < 3.5 * found.std)
+    np.testing.assert_allclose(found.prior_std[first:], np.pi / np.sqrt(3.0))  # of a uniform angle
+    written: Any = found.identified_scenario
+    np.testing.assert_allclose(written.disturbance.phase, found.estimate[first:])
+    assert written.dispersion.disturbance_phase is None
+
+
+def test_a_phase_that_the_log_does_not_tell_from_its_mirror_image_is_named():
+    frame = flight(np.random.default_rng(7), disturbance=lambda t: TORQUE * np.sin(PHASES))[0]
+    slow = {"kind": "sinusoid", "amplitude": 3 * [TORQUE], "frequency": 3 * [1e-6]}
+    found = explore.identify(satellite(identify={}, **{**DISPERSED, "disturbance": slow}), frame)
+    assert found.fits[0].is_white
+    assert not found.is_identified
+    sentences = [f"the data do not tell disturbance_phase_{k} from its mirrored value" for k in (1, 2, 3)]
+    assert found.undetermined == sentences
+
+
 def test_a_wrong_model_does_not_reject_correct_readings_and_has_wide_intervals(disturbed):
     """An earlier version rejected the attitudes as outliers, and its errors were up to 75 standard deviations."""
     found = explore.identify(satellite(**DISPERSED), disturbed)
