@@ -1,11 +1,13 @@
 """`jax.vmap` and `jax.jvp` in structure-of-arrays form: a jaxpr is evaluated component by component over a batch.
 
 XLA's CPU backend vectorises arrays (trials,), but not arrays (trials, 3). So `lanes.vmap` traces a function for one
-trial and interprets its jaxpr with every small array replaced by its components, each an array (trials,):
+trial and interprets its jaxpr with every small array of its loops replaced by components, each an array (trials,):
 
 - Elementwise primitives are applied to each component. Reshapes and slices permute components. Small contractions
   become sums of products. `components` has these rules.
 - Values that do not depend on the trial stay unbatched: their loops carry scalars, their branches stay branches.
+- Equations outside of loops go through `jax.vmap`. They run once, and by components they would take up to a quarter of the
+  compilation.
 - Loops, branches and functions with custom derivative rules are traced again, with components as operands.
 - Large arrays, and primitives without a rule, go through `jax.vmap`.
 
@@ -127,7 +129,7 @@ def _batched_arguments(args: tuple, in_axes: Any) -> tuple[int, tuple, list[Batc
     if len(sizes) != 1:
         raise ValueError(f"the mapped arguments must share one number of trials, found {sorted(sizes)}")
     one_trial = [jax.ShapeDtypeStruct(v.shape[on:], v.dtype, weak_type=jax.typeof(v).weak_type) for v, on in leaves]
-    values = [BatchedArray(v.shape[1:], array=v).split() if on else BatchedArray.unbatched(v) for v, on in leaves]
+    values = [BatchedArray(v.shape[1:], array=v) if on else BatchedArray.unbatched(v) for v, on in leaves]
     return sizes.pop(), jax.tree.unflatten(tree, one_trial), values
 
 
@@ -140,9 +142,9 @@ def _is_mapped(axis: int | None) -> bool:
 def _batch_directions(along: Array, shape: tuple[int, ...], count: int, trials: int) -> BatchedArray:
     """Return directions (count, *shape) or (count, trials, *shape) of a value of this shape."""
     if along.shape == (count, *shape):
-        return BatchedArray(shape, array=along[:, None], axes=DIRECTION).split()
+        return BatchedArray(shape, array=along[:, None], axes=DIRECTION)
     if along.shape == (count, trials, *shape):
-        return BatchedArray(shape, array=along, axes=TRIAL | DIRECTION).split()
+        return BatchedArray(shape, array=along, axes=TRIAL | DIRECTION)
     raise ValueError(f"{count} directions of {shape} in {trials} trials cannot be of shape {along.shape}")
 
 
@@ -155,8 +157,8 @@ class _Interpreter:
         use_kernel: run long scans as a kernel.
     """
 
-    def __init__(self, trials: int, directions: int = 0, use_kernel: bool = False):
-        self.trials, self.directions, self.use_kernel = trials, directions, use_kernel
+    def __init__(self, trials: int, directions: int = 0, use_kernel: bool = False, in_loop: bool = False):
+        self.trials, self.directions, self.use_kernel, self.in_loop = trials, directions, use_kernel, in_loop
         self.batch_shapes = ((), (trials,), (directions, 1), (directions, trials))  # batch shape by `BatchedArray.axes`
         self.rules = components.ComponentRules()
 
@@ -166,12 +168,14 @@ class _Interpreter:
         arguments = _unbatch_empty(arguments, jaxpr.invars)
         return dependence.interpret(jaxpr, consts, arguments, BatchedArray.unbatched, self.apply)
 
-    def evaluate_inside(self, closed: Any, arguments: Sequence[BatchedArray]) -> list[BatchedArray]:
+    def evaluate_inside(
+        self, closed: Any, arguments: Sequence[BatchedArray], *, in_loop: bool = False
+    ) -> list[BatchedArray]:
         """Return the outputs of a jaxpr inside a function that JAX traces, by a separate interpreter.
 
         Arrays of the inner trace must not be stored in this interpreter.
         """
-        return _Interpreter(self.trials, self.directions).evaluate(closed, arguments)
+        return _Interpreter(self.trials, self.directions, in_loop=in_loop or self.in_loop).evaluate(closed, arguments)
 
     def apply(self, eqn: Any, values: list[BatchedArray]) -> list[BatchedArray]:
         """Return the results of one equation."""
@@ -188,7 +192,7 @@ class _Interpreter:
             return self.evaluate(inner, values)
         if name in _CONTROL_FLOW:
             return _CONTROL_FLOW[name](self, eqn, values)
-        if axes == DIRECTION:  # one array for all trials: components would not be faster
+        if axes == DIRECTION or not self.in_loop:  # components would not be faster
             return self.apply_to_arrays(eqn, values)
         if not components.has_rule(name):
             message = f"lanes have no rule for the primitive `{name}`{dependence.source_location(eqn)}"
@@ -246,7 +250,7 @@ class _Interpreter:
                 return last
 
         def step(carry: list, x: list) -> tuple[list, list]:
-            results = self.align(self.evaluate_inside(body, [*consts, *carry, *x]), axes)
+            results = self.align(self.evaluate_inside(body, [*consts, *carry, *x], in_loop=True), axes)
             return results[:count], results[count:]
 
         rows = [self.rows(x) for x in xs]
@@ -272,7 +276,7 @@ class _Interpreter:
         if 0 in shape:
             return BatchedArray(shape, (), axes=axes)
         split = _carried_as_components(value.shape, axes)
-        if split and components.is_small(shape):
+        if self.in_loop and split and components.is_small(shape):
             rows = (lax.index_in_dim(part, k, 0, keepdims=False) for k in range(length) for part in value.parts or ())
             return BatchedArray(shape, tuple(rows), axes=axes)
         array = jnp.stack(value.parts or (), axis=-1) if split else value.array
@@ -308,11 +312,11 @@ class _Interpreter:
         axes, test_axes = dependence.while_dependence(test, body, *map(_axes, (test_consts, body_consts, init)))
 
         def is_running(carry: list) -> Any:
-            (value,) = self.evaluate_inside(test, [*test_consts, *carry])
+            (value,) = self.evaluate_inside(test, [*test_consts, *carry], in_loop=True)
             return value.to_array(self.batch_shapes[test_axes]) if test_axes else value.array
 
         def step(carry: list) -> list:
-            after = self.align(self.evaluate_inside(body, [*body_consts, *carry]), axes)
+            after = self.align(self.evaluate_inside(body, [*body_consts, *carry], in_loop=True), axes)
             if not test_axes:
                 return after
             running = is_running(carry)

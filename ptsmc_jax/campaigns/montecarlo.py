@@ -317,7 +317,7 @@ def evaluate_rows(
 
         def step(k: jax.Array, results: PyTree) -> PyTree:
             row = simulate_row(jax.tree.map(lambda v: v[k], device_rows))
-            return jax.tree.map(lambda array, v: array.at[k].set(v), results, row)
+            return jax.tree.map(lambda array, v: jax.lax.dynamic_update_index_in_dim(array, v, k, 0), results, row)
 
         return jax.tree.map(lambda v: v[None], jax.lax.fori_loop(0, needed_rows, step, empty))
 
