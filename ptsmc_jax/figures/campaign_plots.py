@@ -84,7 +84,7 @@ def in_readable_units(columns: Mapping[str, Column]) -> dict[str, Column]:
 def fan(
     t: np.ndarray, errors: np.ndarray, worst: tuple[int, np.ndarray], parts: Parts, limits: Mapping[str, float]
 ) -> Figure:
-    """Plot the error of many trials over time: central bands, median, worst run.
+    """Plot the error of many trials over time: bands that contain `BANDS` percent of the trials, median, worst trial.
 
     Args:
         t: (time,) [s].

@@ -126,9 +126,12 @@ def tuning_history(
 
 @styled
 def tornado(sensitivities: Mapping[str, Mapping[str, float]]) -> Figure:
-    """Plot the sensitivity of each metric to each gain [% per %], the largest on top; metric -> gain -> sensitivity.
+    """Plot the sensitivity of each metric to each gain [% per %], the largest on top.
 
-    A norm of an error is left out if its angle is there too.
+    An error that has a metric for its norm and one for its angle is plotted once, as an angle.
+
+    Args:
+        sensitivities: sensitivities by metric and gain [-].
     """
     sensitivities = {metric: sensitivities[metric] for metric in without_norms(sensitivities)}
     rows = sum(len(by_gain) + 1 for by_gain in sensitivities.values())
@@ -188,7 +191,7 @@ def tradeoff(
     kind: str = "spacecraft",
     lower_bound: float | None = None,
 ) -> Figure:
-    """Plot accuracy against torque, a point a trial.
+    """Plot accuracy against torque, with one point for each trial.
 
     Args:
         sets: window errors (trials,) [-] and torques (trials,) [N m] by label; the torque is `torque_metric(limits)`.

@@ -166,7 +166,12 @@ class Verdict:
         return f"{requirement}: {result}: {self.word}{reason}"
 
     def _describe_missing_trials(self, noun: str, failures: int) -> str:
-        """Return how many trials the verdict "met" takes; empty unless the verdict is "NOT shown"."""
+        """Return how many trials a verdict "met" needs in all, in words; empty unless the verdict is "NOT shown".
+
+        Args:
+            noun: what the number counts, such as "trials".
+            failures: number of trials beyond the limit.
+        """
         if self.word != "NOT shown" or self.quantile is None or self.confidence is None:
             return ""
         from ptsmc_jax.numerics import statistics  # imports SciPy, which takes a while

@@ -64,7 +64,7 @@ class Bar:
         return _compilation_progress() or self._step + (left if seconds >= 1.0 else "")
 
     def _measure_rate(self, done: int, total: int, *, again: bool = False) -> float:
-        """Return the work done in a second, 0 before it is known, and estimate the end of the work.
+        """Return how much work is done per second, 0 before it is known, and store when the work will probably end.
 
         Args:
             done: work done so far.

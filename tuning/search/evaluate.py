@@ -80,9 +80,9 @@ class Evaluator:
         return Measurement(**self._answer(problem, normalised, with_gradients=False))
 
     def measure_with_gradients(self, problem: Problem, normalised: np.ndarray) -> MeasurementWithGradients:
-        """Return F, constraints and objective with gradients at points, (points, gains) normalised gains.
+        """Return F, constraints and objective with gradients at points of normalised gains, (points, gains).
 
-        Points that were measured since the problem last changed are not simulated again.
+        Points of the problem that was measured last are not simulated again.
         """
         encoded, keys = _encode_request(b"", problem, normalised[:0]), [point.tobytes() for point in normalised]
         if encoded != self._known_problem:

@@ -33,9 +33,11 @@ def units(plant: str) -> dict[str, str]:
 
 
 def units_of(scenario: Scenario, names: Iterable[str]) -> dict[str, str]:
-    """Return the unit of each of these gains by name, without the number of an axis.
+    """Return the units of gains by name. All axes of a gain, such as `gain[1]`, share the name of the gain.
 
-    The gains belong to a scenario, which may have custom laws and observers, or to another law for its plant.
+    Args:
+        scenario: scenario, which may have custom laws and observers.
+        names: names of gains of its law and observer, or of other laws for its plant.
     """
     known = units(scenario.plant.kind) | _collect_units(type(table) for table in scenario.tuned_tables.values())
     return {name: known[name] for name in map(base, names) if name in known}

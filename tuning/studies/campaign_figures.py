@@ -114,7 +114,7 @@ def _plot_fan(
 ) -> dict[str, Figure]:
     """Simulate the first trials and the trial with the largest window error again, and plot their errors over time.
 
-    The result is empty if none of the first trials reaches its end, or if all errors are zero: the axis is logarithmic.
+    There is no figure if none of the first trials reaches its end, or if all errors are zero: its axis is logarithmic.
     """
     trials, window = frame["trial"].to_numpy(), frame["window_error"].to_numpy()  # a shard has only some of the trials
     first_trials = trials[:FAN_TRIALS]
