@@ -106,6 +106,23 @@ def bind(eqn: Any, operands: Sequence) -> Sequence:
     return out if eqn.primitive.multiple_results else [out]
 
 
+def contract(eqn: Any, operands: Sequence[jax.Array]) -> Sequence[jax.Array]:
+    """Return the result of a `dot_general` as a sum of products.
+
+    XLA's CPU compiler aborts the process for some batches of `dot_general`, for example of derivatives.
+    """
+    out = eqn.outvars[0].aval
+
+    def group_axes(array: jax.Array, axes: Sequence[int], batch: Sequence[int]) -> jax.Array:
+        """Return the array as (batch, kept, contracted)."""
+        kept = [a for a in range(array.ndim) if a not in (*axes, *batch)]
+        sizes = [math.prod(array.shape[a] for a in group) for group in (batch, kept, axes)]
+        return array.astype(out.dtype).transpose([*batch, *kept, *axes]).reshape(sizes)
+
+    a, b = (group_axes(*each) for each in zip(operands, *eqn.params["dimension_numbers"], strict=True))
+    return [jnp.sum(a[:, :, None] * b[:, None], axis=-1).astype(out.dtype).reshape(out.shape)]
+
+
 def zero_tangent(eqn: Any) -> np.ndarray | None:
     """Return constant zeros if the equation fills an array with zeros, as `jax.jvp` does. Return None otherwise."""
     if eqn.primitive.name != "broadcast_in_dim" or not isinstance(eqn.invars[0], core.Literal):

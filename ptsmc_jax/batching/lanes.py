@@ -210,8 +210,11 @@ class _Interpreter:
             array = value.to_array(self.batch_shapes[value.axes]) if value.axes else value.array
             return array[:, 0] if value.axes == DIRECTION else array
 
+        is_small = all(components.is_small(v.aval.shape) for v in (*eqn.invars, *eqn.outvars))
+        bind = components.contract if eqn.primitive.name == "dot_general" and is_small else components.bind
+
         def function(*operands: Any) -> Any:
-            return components.bind(eqn, operands)
+            return bind(eqn, operands)
 
         size = (self.trials if axes & TRIAL else 1) * (self.directions if axes & DIRECTION else 1)
         transform = lapack.choose_vmap([eqn], size)

@@ -295,6 +295,12 @@ def test_warnings_name_the_primitive_and_the_source_line():
         lanes.vmap(in_loop(lambda m: lax.linalg.cholesky(m)))(matrices)
 
 
+def test_small_contractions_outside_loops_are_sums_of_products():
+    """XLA aborts the process for some batches of contractions, for example of derivatives."""
+    traced = jax.make_jaxpr(lanes.vmap(lambda m, x: m @ (m @ x)))(draw(3, 3), X)
+    assert not [eqn for eqn in equations(traced) if eqn.primitive.name == "dot_general"]
+
+
 def test_large_arrays_are_not_split_into_components():
     function = lanes.vmap(in_loop(lambda t: 2 * t + 1))
     few, many = (len(list(equations(jax.make_jaxpr(function)(draw(n))))) for n in (65, 64))
