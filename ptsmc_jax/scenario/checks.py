@@ -183,7 +183,8 @@ def _check_dispersion(scenario: Scenario) -> None:
             raise ScenarioError(f"dispersion.{key} needs {needed}")
     for low, high, unit in (("min_deg", "max_deg", " deg"), ("earliest", "latest", " s"), ("smallest", "largest", "")):
         for name, table in random.items():
-            smallest, largest = getattr(table, low, None), getattr(table, high, None) or scenario.end
+            smallest, largest = getattr(table, low, None), getattr(table, high, None)
+            largest = scenario.end if largest is None else largest  # the default of `latest`
             if smallest is not None and smallest > largest:
                 raise wrong(f"dispersion.{name}.{low}", smallest, f"at most {high}, {largest}{unit}")
     if "x0" in random:
