@@ -55,7 +55,7 @@ def _target_below_horizon(scenario: Scenario) -> Iterator[str]:
 
 
 def _implausible_inertia(scenario: Scenario) -> Iterator[str]:
-    """Warn if the torque limits contradict the inertia: almost no slew is possible, or a large turn in one period.
+    """Warn if the torque limits contradict the inertia: almost no slew, or a large turn in a control period.
 
     A turn by the angle a in the time t needs at least the acceleration 4 a / t^2: half of the time each to speed up
     and to slow down.
@@ -64,7 +64,7 @@ def _implausible_inertia(scenario: Scenario) -> Iterator[str]:
     limit = scenario.largest_acceleration() if scenario.motion == "spacecraft" else None
     if limit is None:
         return
-    acceleration, period = 2.0 * limit, scenario.loop.period  # [rad/s^2], since the error is tan(angle / 2)
+    acceleration = 2.0 * limit  # [rad/s^2], since the error is tan(angle / 2)
     beginning = f"spacecraft.inertia is {errors.brief(any_scenario.spacecraft.inertia)} kg m^2: "
     units = "check the units, 1 kg m^2 is 1e4 kg cm^2 or 1e7 g cm^2"
     angle, t_f = any_scenario.start_angle(), scenario.controller.t_f
@@ -74,9 +74,10 @@ def _implausible_inertia(scenario: Scenario) -> Iterator[str]:
             f"{beginning}the turn by {np.rad2deg(angle):.3g} deg in controller.t_f = {t_f:g} s needs at least "
             f"{needed:.3g} rad/s^2, but the torque limit allows {acceleration:.3g} rad/s^2; {units}"
         )
-    turn = 0.5 * acceleration * period**2
-    if turn > MAX_TURN:
-        yield f"{beginning}the torque limit turns the body by {turn:.3g} rad in one period, {period:g} s; {units}"
+    turn = 0.5 * acceleration * scenario.loop.period**2
+    if scenario.sampled and turn > MAX_TURN:
+        period = f"one period, {scenario.loop.period:g} s"
+        yield f"{beginning}the torque limit turns the body by {turn:.3g} rad in {period}; {units}"
 
 
 def _delay_in_seconds(scenario: Scenario) -> Iterator[str]:

@@ -430,6 +430,11 @@ def test_an_inertia_in_another_unit_contradicts_the_torque_limit(factor, said, a
     assert [said in one for one in found] == ([] if said is None else [True])
 
 
+def test_a_large_required_torque_of_a_continuous_loop_causes_no_warning_about_its_period():
+    tables = {"loop": {"mode": "continuous"}, "requirements": {"peak_torque": 1e5}}
+    assert not plausibility.warnings(scenario.from_tables(tables))
+
+
 @pytest.mark.parametrize(
     "path", sorted(ROOT.glob("scenarios/*.toml")) + sorted(ROOT.glob("benchmarks/satellites/*.toml"))
 )
