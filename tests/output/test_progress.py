@@ -62,16 +62,27 @@ def test_the_rate_of_a_campaign_is_measured_after_its_first_part(monkeypatch):
 
 
 def test_the_time_left_of_a_step_follows_from_the_work_done_so_far(monkeypatch):
-    steps = [(5.0, "searching", 0, 8), (35.0, "searching", 1, 8), (65.0, "searching", 2, 8), (155.0,), (300.0,),
-             (301.0, "refining", 0, 2), (311.0, "refining", 2, 2)]  # fmt: skip
+    steps = [
+        (5.0, "searching", 0, 8),
+        (35.0, "searching", 1, 8),
+        (65.0, "searching", 2, 8),
+        (155.0,),
+        (300.0,),
+        (301.0, "refining", 0, 4),
+        (311.0, "refining", 4, 4),
+        (321.0, "judging", 0, 4),
+        (325.0, "judging", 2, 4),
+    ]
     assert reported(progress.Progress(quiet=True), monkeypatch, *steps) == [
         "searching, 0 of 8",
         "searching, 1 of 8",  # the first piece of work may include a compilation
         "searching, 2 of 8, about 3 min left in this step",
         "searching, 2 of 8, about 90 s left in this step",
         "searching, 2 of 8",
-        "refining, 0 of 2",
-        "refining, 2 of 2",
+        "refining, 0 of 4",
+        "refining, 4 of 4",
+        "judging, 0 of 4",  # another step with as much work
+        "judging, 2 of 4, about 4 s left in this step",
     ]
 
 

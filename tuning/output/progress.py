@@ -35,8 +35,8 @@ class Bar:
         self._prints_lines = not quiet and not console.is_terminal
         self._start_time, self._ended = time.monotonic(), threading.Event()
         self._step = "compiling"  # the step in words
-        # work in all, and time and work done of the report that the rate is measured from
-        self._total, self._first_time, self._first_done = 0, self._start_time, 0
+        self._total, self._done = 0, 0  # work in all, and work done
+        self._first_time, self._first_done = self._start_time, 0  # of the report that the rate is measured from
         self._end_time = -math.inf  # estimated time of the monotonic clock at the end of the work
         self._bar = progress.Progress(
             progress.RenderableColumn(self),
@@ -67,13 +67,14 @@ class Bar:
         """Return how much work is done per second, 0 before it is known, and store when the work will probably end.
 
         Args:
-            done: work done so far.
+            done: work done so far. The measurement begins again if it decreases, in a new step.
             total: work in all. The measurement begins again if it changes.
             again: begin the measurement again.
         """
         now = time.monotonic()
-        if again or total != self._total:
-            self._total, self._first_time, self._first_done = total, now, done
+        if again or total != self._total or done < self._done:
+            self._first_time, self._first_done = now, done
+        self._total, self._done = total, done
         seconds, measured = now - self._first_time, done - self._first_done
         rate = measured / seconds if seconds >= SHORTEST and measured > 1 else 0.0
         self._end_time = now + (total - done) / rate if rate else -math.inf
