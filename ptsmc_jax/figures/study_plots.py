@@ -212,9 +212,10 @@ def tradeoff(
         axes.loglog(rms, mean, marker, ms=9, color=colour, mec="white", label=text, zorder=2 + above)
     if torque in limits:
         axes.axhline(limits[torque], **LIMIT, label=f"limit of {torque} {limits[torque]:g} {unit}")
-    for metric in limits.keys() & {"window_error", "window_angle"}:
-        limit = float(metric_display(metric, kind)[0](limits[metric]))
-        axes.axvline(limit, **LIMIT, label=f"limit of {metric} {limit:.4g} {error_unit}")
+    for metric in ("window_error", "window_angle"):
+        if metric in limits:
+            limit = float(metric_display(metric, kind)[0](limits[metric]))
+            axes.axvline(limit, **LIMIT, label=f"limit of {metric} {limit:.4g} {error_unit}")
     if lower_bound:
         least = float(convert(lower_bound))
         axes.axvline(least, **LOWER_BOUND, label=f"lower bound {least:.3g} {error_unit}")
