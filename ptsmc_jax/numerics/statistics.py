@@ -234,6 +234,21 @@ def explained_variance(driver: Mapping[str, float | None], trials: int) -> float
     return max(index, rank**2) if significant else 0.0
 
 
+def strongest_drivers(drivers: Mapping[str, Mapping[str, float | None]], trials: int) -> dict[str, float]:
+    """Return the `explained_variance` of each input with at least `MIN_EXPLAINED`, the largest first.
+
+    Args:
+        drivers: result of the function `drivers`.
+        trials: number of trials.
+
+    >>> strongest_drivers({"x": {"rank_correlation": 0.5, "first_order": 0.2}}, 1000)
+    {'x': 0.25}
+    """
+    explained = {name: explained_variance(driver, trials) for name, driver in drivers.items()}
+    named = (name for name, fraction in explained.items() if fraction >= MIN_EXPLAINED)
+    return {name: explained[name] for name in sorted(named, key=lambda name: -explained[name])}
+
+
 def _first_order_index(bins: Sequence[np.ndarray], count: int) -> float:
     """Return the variance between bins of `count` ranks, minus its expected value for unrelated bins."""
     between = _variance_between(bins, count)

@@ -129,13 +129,8 @@ def driver_lines(summary: Campaign) -> Iterator[str]:
     unexplained = list[str]()
     for metric in catalogues.without_norms(("window_error", *(one.metric for one in summary.verdicts))):
         sensitivities = summary.drivers.get(metric, {})
-        explained = {
-            name: statistics.explained_variance(driver, summary.driver_trials[metric])
-            for name, driver in sensitivities.items()
-        }
-        strongest = sorted((name for name in explained if explained[name] >= statistics.MIN_EXPLAINED),
-                           key=lambda name: -explained[name])[:3]  # fmt: skip
-        texts = []
+        explained = statistics.strongest_drivers(sensitivities, summary.driver_trials.get(metric, 0))
+        strongest, texts = list(explained)[:3], []
         for name in strongest:
             rank = sensitivities[name]["rank_correlation"]
             # the number of a wheel has no rank correlation

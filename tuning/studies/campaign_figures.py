@@ -71,14 +71,12 @@ def build(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
 
 
 def _strongest_inputs(summary: dict[str, Any], metrics: Sequence[str]) -> list[str]:
-    """Return the inputs that explain one of the metrics best, at most four; see `statistics.explained_variance`."""
+    """Return the inputs that explain one of the metrics best, at most four; see `statistics.strongest_drivers`."""
     explained = dict[str, float]()
-    for metric in metrics:
-        for name, driver in summary["drivers"].get(metric, {}).items():
-            fraction = statistics.explained_variance(driver, summary["driver_trials"][metric])
-            explained[name] = max(fraction, explained.get(name, 0.0))
-    named = [name for name, fraction in explained.items() if fraction >= statistics.MIN_EXPLAINED]
-    return sorted(named, key=lambda name: -explained[name])[:4]
+    for metric in (name for name in metrics if name in summary["drivers"]):
+        strongest = statistics.strongest_drivers(summary["drivers"][metric], summary["driver_trials"][metric])
+        explained |= {name: max(fraction, explained.get(name, 0.0)) for name, fraction in strongest.items()}
+    return sorted(explained, key=lambda name: -explained[name])[:4]
 
 
 def _classify_trials(frame: pl.DataFrame, required: Sequence[Requirement]) -> np.ndarray:
