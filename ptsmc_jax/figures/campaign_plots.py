@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ptsmc_jax.figures.run_plots import draw_error_limits
+from ptsmc_jax.figures.run_plots import draw_error_limits, plant_kind
 from ptsmc_jax.figures.style import (
     LIMIT,
     STYLES,
@@ -94,7 +94,7 @@ def fan(
         limits: required limits by metric, in the unit of the metric.
     """
     t_f = float(parts.controller.t_f)
-    convert, name, unit = error_display("spacecraft" if parts.controller.kinematics.angle_unit == "rad" else "chain")
+    convert, name, unit = error_display(plant_kind(parts))
     errors, largest = convert(errors), convert(worst[1])
     trials = f"{len(errors)} trial{'s' if len(errors) != 1 else ''}"
     figure, axes = new_figure(f"{name.capitalize()} of {trials}, median in white", with_unit(name, unit))

@@ -1,20 +1,18 @@
 """The open loop as figures: Nichols chart, sensitivity, margins against time to go."""
 
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ptsmc_jax.figures.style import LIMIT, STYLES, legend_below, logarithmic, plain_ticks, styled
+from ptsmc_jax.figures.style import LIMIT, NO_LIMITS, STYLES, legend_below, logarithmic, plain_ticks, styled
+from ptsmc_jax.simulation.catalogues import MARGINS
 from ptsmc_jax.theory.margins import Margins
 
 CONTOUR = 6.0  # sensitivity of the contour without a required limit [dB]
 LARGEST_SHOWN = 40.0  # |L| is drawn from minus this value to this value [dB]
-MARGIN_UNITS = (("gain_margin", "dB"), ("phase_margin", "deg"))  # margins that a Nichols chart shows
-NO_LIMITS: Mapping[str, float] = MappingProxyType({})
 
 
 def _sensitivity_line(limits: Mapping[str, float], style: str) -> dict[str, Any]:
@@ -48,10 +46,11 @@ def nichols(L: np.ndarray, names: Sequence[str], limits: Mapping[str, float] = N
     contour = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 721)) * 10.0 ** (-largest / 20.0) - 1.0
     angle = np.rad2deg(np.angle(contour)) % 360.0 - 360.0
     axes.plot(angle, _decibels(contour), **_sensitivity_line(limits, "-"))
-    gain, phase = (limits.get(name, np.nan) for name in ("gain_margin", "phase_margin"))
+    shown = ("gain_margin", "phase_margin")
+    gain, phase = (limits.get(name, np.nan) for name in shown)
     axes.plot([-180.0, -180.0], [-gain, gain], **LIMIT)
     axes.plot([-180.0 - phase, -180.0 + phase], [0.0, 0.0], **LIMIT)
-    required = [f"{name} {limits[name]:g} {unit}" for name, unit in MARGIN_UNITS if name in limits]
+    required = [f"{name} {limits[name]:g} {MARGINS[name].unit}" for name in shown if name in limits]
     if required:
         axes.plot([], [], **LIMIT, label=f"limits of {', '.join(required)}")
     axes.plot(-180.0, 0.0, "+", color="0.0", ms=12, mew=1.6)

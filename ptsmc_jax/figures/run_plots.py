@@ -1,7 +1,6 @@
 """Histories of runs as matplotlib figures with units. Each function returns a Figure."""
 
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any
 
 import jax
@@ -13,6 +12,7 @@ from numpy.typing import ArrayLike
 from ptsmc_jax.figures.style import (
     ACTUATOR_LIMIT,
     LIMIT,
+    NO_LIMITS,
     STYLES,
     error_display,
     legend_below,
@@ -30,7 +30,6 @@ FAR_OFF = 3.0  # a limit or command beyond this multiple of the curves is only n
 SMALLEST, LARGEST = 1e-16, 1e100  # log axes end at SMALLEST; larger numbers than LARGEST are left out
 EXACT_LINE: Any = {"color": "0.25", "lw": 0.9, "ls": (0, (1, 1.5))}  # style of the line of the exact motion
 BOUND_LINE: Any = {"color": "0.35", "lw": 1.0, "ls": "--", "label": "bound, no noise"}
-NO_LIMITS: Mapping[str, float] = MappingProxyType({})
 
 
 def run_figures(
@@ -73,7 +72,7 @@ def error(
     parts: Parts, log: Log, limits: Mapping[str, float] = NO_LIMITS, lower_bound: LowerBound | None = None
 ) -> Figure:
     """Plot the error's 2-norm on a log scale, with its bounds, its limits and the window of window_error."""
-    if parts.controller.kinematics.angle_unit == "rad":
+    if plant_kind(parts) == "spacecraft":
         convert, name, unit = error_display("spacecraft")
         figure, axes = new_figure(name.capitalize(), with_unit(name, unit))
     else:
@@ -96,9 +95,13 @@ def error(
     return figure
 
 
+def plant_kind(parts: Parts) -> str:
+    """Return a kind of plant with the same unit of the error, see `style.error_display`."""
+    return "spacecraft" if parts.controller.kinematics.angle_unit == "rad" else "chain"
+
+
 def draw_error_limits(axes: Axes, parts: Parts, limits: Mapping[str, float], t_end: float) -> None:
     """Draw the required limits of the error, each in the interval in which it applies; `limits`: see `run_figures`."""
-    plant = "spacecraft" if parts.controller.kinematics.angle_unit == "rad" else "chain"
     t_f = float(parts.controller.t_f)
     intervals = {"terminal": (t_f, t_f), "window": (t_f, t_f + float(parts.window)), "hold": (t_f, t_end)}
     if parts.pointing is not None:
@@ -106,7 +109,7 @@ def draw_error_limits(axes: Axes, parts: Parts, limits: Mapping[str, float], t_e
     for metric, limit in limits.items():
         interval = intervals.get(metric.split("_")[0])
         if interval is not None:
-            convert, unit = metric_display(metric, plant)
+            convert, unit = metric_display(metric, plant_kind(parts))
             shown = float(convert(limit))
             label = f"limit of {metric} {shown:.4g} {unit}".rstrip()
             axes.plot(interval, (shown, shown), marker="_", ms=8, **LIMIT, label=label)

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Container, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 import matplotlib.style
@@ -26,6 +27,7 @@ LIMIT: Any = {"color": "0.3", "lw": 1.0, "ls": (0, (6, 3))}  # style of the line
 ACTUATOR_LIMIT: Any = {"color": "0.3", "lw": 1.0, "ls": (0, (6, 2, 1, 2))}  # style of the line of an actuator's limit
 LOWER_BOUND: Any = {"color": "0.3", "lw": 1.0, "ls": ":"}  # style of the line of a lower bound
 TORQUES = ("peak_torque", "peak_torque_delivered", "peak_wheel_torque")
+NO_LIMITS: Mapping[str, float] = MappingProxyType({})
 LEGEND_WIDTH = 110  # largest width of a legend below the axes, in characters
 WIDE_RATIO = 1e4  # ratio of an axis's ends above which numbers between powers of ten would overlap
 
