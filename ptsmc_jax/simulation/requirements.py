@@ -112,6 +112,19 @@ class Verdict:
         is_kept = replace(self, confidence=None, shown=self.fraction_of_time).met
         return "NOT shown" if too_few and is_kept else "NOT met"
 
+    @property
+    def fewest_trials(self) -> int | None:
+        """The smallest number of trials that verifies the quantile, with as many failures; None without a confidence.
+
+        If the requirement is on the time, it is the number without any failure.
+        """
+        if self.quantile is None or self.confidence is None:
+            return None
+        from ptsmc_jax.numerics import statistics  # imports SciPy, which takes a while
+
+        failures = self.failures if self.fraction_of_time is None else 0
+        return statistics.fewest_trials(failures, self.quantile, self.confidence)
+
     @classmethod
     def read(cls, entry: Mapping[str, Any]) -> "Verdict":
         """Return the verdict of an entry in `summary.json`. A null there is a number that is not finite."""
@@ -138,7 +151,7 @@ class Verdict:
         result = f"{percent(fraction)} %"
         if self.confidence is not None and self.shown is not None:
             result += f", at least {percent(self.shown)} % at {100 * self.confidence:g} % confidence"
-        return f"{requirement}: {result}: {self.word}{self._describe_missing_trials('runs', 0)}"
+        return f"{requirement}: {result}: {self.word}{self._describe_missing_trials('runs')}"
 
     def _describe_trials(self) -> str:
         failures, trials, worst = self.failures, self.trials, self.worst
@@ -159,25 +172,18 @@ class Verdict:
         if self.met:
             reason = f", beyond it {failures} of {trials} {noun}" if failures else ""
         elif self.word == "NOT shown":
-            reason = self._describe_missing_trials(noun, failures)
+            reason = self._describe_missing_trials(noun)
         else:
             allowed = f", at most {trials - least} allowed" if least is not None and trials > least else ""
             reason = f" in {failures} of {trials} {noun}{allowed}" if trials > 1 else ""
         return f"{requirement}: {result}: {self.word}{reason}"
 
-    def _describe_missing_trials(self, noun: str, failures: int) -> str:
-        """Return how many trials a verdict "met" needs in all, in words; empty unless the verdict is "NOT shown".
-
-        Args:
-            noun: what the number counts, such as "trials".
-            failures: number of trials beyond the limit.
-        """
-        if self.word != "NOT shown" or self.quantile is None or self.confidence is None:
+    def _describe_missing_trials(self, noun: str) -> str:
+        """Return how many trials a verdict "met" needs, in words; empty unless the verdict is "NOT shown"."""
+        if self.word != "NOT shown":
             return ""
-        from ptsmc_jax.numerics import statistics  # imports SciPy, which takes a while
-
-        needed = statistics.fewest_trials(failures, self.quantile, self.confidence)
-        return f", which takes at least {needed} {noun} with {'as many failures' if failures else 'no failure'}"
+        failures = "as many failures" if self.failures and self.fraction_of_time is None else "no failure"
+        return f", which takes at least {self.fewest_trials} {noun} with {failures}"
 
 
 def quantity(value: float, unit: str, digits: int, metric: str = "") -> str:

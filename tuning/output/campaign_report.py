@@ -72,7 +72,7 @@ def verdict_with_fraction(entry: Entry) -> str:
     text += f"; {percent(entry.fraction)} % of trials keep the limit (95 %: {percent(low)} to {percent(high)} %)"
     if entry.quantile is not None and entry.confidence is not None and entry.fraction_bound is not None:
         text += f", at least {percent(entry.fraction_bound)} % at {100 * entry.confidence:g} % one-sided confidence"
-        if entry.fraction > entry.quantile and entry.word != "NOT shown":  # the verdict has the number then
+        if entry.fraction > entry.quantile and entry.word != "NOT shown":  # "NOT shown" comes with this number
             failures = "as many failures" if entry.failures else "no failure"
             text += f"; {entry.fewest_trials} trials with {failures} are enough"
     return text

@@ -94,10 +94,7 @@ def _verdict_entry(verdict: Verdict, requirement: Requirement, beyond: np.ndarra
         entry["fraction"] = within / verdict.trials
         entry["fraction_interval"] = statistics.fraction_interval(within, verdict.trials, CONFIDENCE)
         entry["fraction_bound"] = statistics.fraction_bound(within, verdict.trials, confidence)
-    if requirement.quantile is not None and requirement.confidence is not None:
-        failures = verdict.failures if requirement.timed is None else 0
-        entry["fewest_trials"] = statistics.fewest_trials(failures, requirement.quantile, requirement.confidence)
-    return entry
+    return entry if verdict.fewest_trials is None else {**entry, "fewest_trials": verdict.fewest_trials}
 
 
 def summarise(folder: Folder) -> dict[str, Any]:
