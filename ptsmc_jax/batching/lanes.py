@@ -155,6 +155,7 @@ class _Interpreter:
         trials: size of the batch.
         directions: number of directions of tangents, 0 without tangents.
         use_kernel: run long scans as a kernel.
+        in_loop: evaluate the equations by components, because they are in a loop.
     """
 
     def __init__(self, trials: int, directions: int = 0, use_kernel: bool = False, in_loop: bool = False):
