@@ -143,7 +143,7 @@ def test_a_custom_system_has_the_same_journal_questions_in_another_process():
         tables = {"plant": {"kind": "system", "system": pendulum, "x0": [1.0, 0.0]}, "loop": {"mode": "sampled"}}
         ready = scenario.study(scenario.from_tables(tables))
         posed = problem(ready.parts, ready.dispersion, 0, np.arange(2), ("eta",))
-        return pendulum, evaluate._encode_request(b"values", posed, np.zeros((1, 1)))
+        return pendulum, evaluate._encode(posed)
 
     (one, asked), (other, again) = question(), question()
     assert one != other

@@ -84,7 +84,7 @@ class Evaluator:
 
         Points of the problem that was measured last are not simulated again.
         """
-        encoded, keys = _encode_request(b"", problem, normalised[:0]), [point.tobytes() for point in normalised]
+        encoded, keys = _encode(problem), [point.tobytes() for point in normalised]
         if encoded != self._known_problem:
             self._known_problem, self._known = encoded, {}
         new = [k for k, key in enumerate(keys) if key not in self._known]
@@ -103,7 +103,7 @@ class Evaluator:
             return values if problem.margins is None else self._add_margins(values, problem, normalised)
 
         kind = b"gradients" if with_gradients else b"values"
-        return self._journal.get(_encode_request(kind, problem, normalised), compute)
+        return self._journal.get(b"|".join([kind, normalised.tobytes(), _encode(problem)]), compute)
 
     def _simulate_and_judge(
         self, problem: Problem, normalised: np.ndarray, with_gradients: bool
@@ -161,10 +161,10 @@ def _apply_in_calls(program: Callable[..., dict[str, jax.Array]], *arrays: np.nd
 _ADDRESS = re.compile("0x[0-9a-f]+")  # address of a custom function, different in each process
 
 
-def _encode_request(kind: bytes, problem: Problem, normalised: np.ndarray) -> bytes:
+def _encode(problem: Problem) -> bytes:
     leaves, structure = jax.tree.flatten(problem)
     structure_text = _ADDRESS.sub("", str(structure)).encode()
-    return b"|".join([kind, normalised.tobytes(), structure_text, *(np.asarray(leaf).tobytes() for leaf in leaves)])
+    return b"|".join([structure_text, *(np.asarray(leaf).tobytes() for leaf in leaves)])
 
 
 @programs.jit(compiler_options=programs.FAST_COMPILE)
