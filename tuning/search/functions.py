@@ -128,14 +128,14 @@ def minimise(
 
     differentiate = jax.jit(lambda normalised: (evaluate(normalised), jax.jacfwd(evaluate)(normalised)))
 
-    gradients = 0
+    measured = 0  # number of points with gradients
 
     def measure_with_gradients(normalised: np.ndarray) -> MeasurementWithGradients:
         """Return the values and gradients at one point, (1, n)."""
-        nonlocal gradients
-        gradients += 1
-        (f, c), slopes = jax.tree.map(lambda v: np.asarray(v)[None], differentiate(normalised[0]))
-        return MeasurementWithGradients(normalised, f, c, np.zeros_like(f), *slopes)
+        nonlocal measured
+        measured += 1
+        (f, c), gradients = jax.tree.map(lambda v: np.asarray(v)[None], differentiate(normalised[0]))
+        return MeasurementWithGradients(normalised, f, c, np.zeros_like(f), *gradients)
 
     points = sobol_points(lower.size, settings.sampled, np.random.default_rng(settings.seed))
     f, c = map(np.asarray, jax.jit(jax.vmap(evaluate))(points))
@@ -156,4 +156,4 @@ def minimise(
     if not successful:  # no starting point has a finite gradient
         raise ValueError("the objective has a finite gradient at no starting point")
     results = [Local(to_box(best.normalised), best.f, best.violation) for best in successful]
-    return Search(results, settings.sampled, gradients)
+    return Search(results, settings.sampled, measured)
