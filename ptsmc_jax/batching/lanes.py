@@ -6,8 +6,7 @@ trial and interprets its jaxpr with every small array of its loops replaced by c
 - Elementwise primitives are applied to each component. Reshapes and slices permute components. Small contractions
   become sums of products. `components` has these rules.
 - Values that do not depend on the trial stay unbatched: their loops carry scalars, their branches stay branches.
-- Equations outside of loops go through `jax.vmap`. They run once, and by components they would take up to a quarter
-  of the compilation.
+- Equations outside of loops go through `jax.vmap`. They run once, so components would only prolong the compilation.
 - Loops, branches and functions with custom derivative rules are traced again, with components as operands.
 - Large arrays, and primitives without a rule, go through `jax.vmap`.
 
