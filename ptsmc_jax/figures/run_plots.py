@@ -22,6 +22,7 @@ from ptsmc_jax.figures.style import (
     with_unit,
 )
 from ptsmc_jax.plants.base import Chart
+from ptsmc_jax.simulation.catalogues import CATALOGUE
 from ptsmc_jax.simulation.rollout import Log, Parts
 from ptsmc_jax.theory import envelopes, solutions
 from ptsmc_jax.theory.lower_bound import LowerBound
@@ -52,8 +53,9 @@ def run_figures(
     if np.any(log.d_hat):
         figures["disturbance"] = disturbance(parts, log)
     if log.wheels is not None:
-        figures["wheels"] = wheels(parts, log, limits, 0, "Momentum of the reaction wheels", "momentum", "N m s")
-        figures["wheel_torque"] = wheels(parts, log, limits, 1, "Torque of the reaction wheels", "torque", "N m")
+        momentum, wheel_torque = log.wheels
+        figures["wheels"] = wheels(parts, log, limits, "momentum", momentum, "h")
+        figures["wheel_torque"] = wheels(parts, log, limits, "torque", wheel_torque, "v")
     return {**{chart.name: state(parts, log, chart) for chart in parts.plant.charts}, **figures}
 
 
@@ -101,7 +103,7 @@ def plant_kind(parts: Parts) -> str:
 
 
 def draw_error_limits(axes: Axes, parts: Parts, limits: Mapping[str, float], t_end: float) -> None:
-    """Draw the required limits of the error, each in the interval in which it applies; `limits`: see `run_figures`."""
+    """Draw the required limits of the error, each over the interval that it limits; `limits`: see `run_figures`."""
     t_f = float(parts.controller.t_f)
     intervals = {"terminal": (t_f, t_f), "window": (t_f, t_f + float(parts.window)), "hold": (t_f, t_end)}
     if parts.pointing is not None:
@@ -143,17 +145,24 @@ def torque(parts: Parts, log: Log, limits: Mapping[str, float] = NO_LIMITS, titl
 
 
 def wheels(
-    parts: Parts, log: Log, limits: Mapping[str, float], index: int, title: str, quantity: str, unit: str
+    parts: Parts, log: Log, limits: Mapping[str, float], quantity: str, values: ArrayLike, symbol: str
 ) -> Figure:
-    """Plot a quantity of each wheel over time, `log.wheels[index]`, with the required limit and that of `Wheels`."""
-    assert log.wheels is not None
-    figure, axes = new_figure(title, f"{quantity} [{unit}]")
-    _plot_components(axes, log.t, log.wheels[index], "hv"[index])
-    metric, wheel_limit = f"peak_wheel_{quantity}", f"{quantity}_limit"
+    """Plot a quantity of each reaction wheel over time, with the required limit and the limit of the wheels.
+
+    Args:
+        parts: parts of the run.
+        log: history of the run.
+        limits: required limits by metric, in the unit of the metric.
+        quantity: "momentum" or "torque".
+        values: the quantity (time, wheel) in the unit of its metric.
+        symbol: symbol of the quantity.
+    """
+    metric, key = f"peak_wheel_{quantity}", f"{quantity}_limit"
+    unit = CATALOGUE[metric].unit
+    figure, axes = new_figure(f"{quantity.capitalize()} of the reaction wheels", f"{quantity} [{unit}]")
+    _plot_components(axes, log.t, values, symbol)
     _draw_limit(axes, limits.get(metric), f"limit of {metric}", f" {unit}")
-    _draw_limit(
-        axes, getattr(parts.actuators.wheels, wheel_limit, None), f"wheels.{wheel_limit}", f" {unit}", ACTUATOR_LIMIT
-    )
+    _draw_limit(axes, getattr(parts.actuators.wheels, key, None), f"wheels.{key}", f" {unit}", ACTUATOR_LIMIT)
     _mark_t_f_and_add_legend(figure, parts)
     return figure
 
