@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import polars as pl
+from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 
 from ptsmc_jax.campaigns import run_tables
@@ -302,7 +303,8 @@ def _check_rates_match_attitudes(table: _Table, t: Values, readings: dict[str, V
     """Raise RefusedError if the attitudes and the rates describe different motions.
 
     The sum of the rotations from sample to sample over each part of the log is compared with the integral of the rate.
-    Parts that turn by less than 0.02 rad, or by more than 0.5 rad between two samples, are ignored.
+    Parts that turn by less than 0.02 rad, or by more than 0.5 rad between two samples, are ignored. Medians of three
+    readings replace the readings, so that a part with an outlier does not seem to turn.
     """
     if set(readings) != {"attitude", "rate"}:
         return
@@ -312,12 +314,13 @@ def _check_rates_match_attitudes(table: _Table, t: Values, readings: dict[str, V
     if part_ends.size < MIN_ROWS:
         return
     has_rate = ~np.isnan(rate[:, 0])
-    interpolated = np.stack([np.interp(t, t[has_rate], column[has_rate]) for column in rate.T], axis=1)
+    smooth_rate = median_filter(rate[has_rate], (3, 1))
+    interpolated = np.stack([np.interp(t, t[has_rate], column) for column in smooth_rate.T], axis=1)
     increments = 0.5 * (interpolated[1:] + interpolated[:-1]) * np.diff(t)[:, None]
     integral = np.concatenate([np.zeros((1, 3)), np.cumsum(increments, axis=0)])[common_rows]
     attitudes = Rotation.from_quat(q[common_rows])
     rotations = (attitudes[:-1].inv() * attitudes[1:]).as_rotvec()
-    turns = np.concatenate([np.zeros((1, 3)), np.cumsum(rotations, axis=0)])
+    turns = median_filter(np.concatenate([np.zeros((1, 3)), np.cumsum(rotations, axis=0)]), (3, 1))
     turn, rate_turn = (np.diff(values[part_ends], axis=0) for values in (turns, integral))
     largest_step = np.maximum.reduceat(np.linalg.norm(rotations, axis=1), part_ends[:-1])
     angle, difference = np.linalg.norm(turn, axis=1), np.linalg.norm(turn - rate_turn, axis=1)

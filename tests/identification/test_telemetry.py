@@ -158,6 +158,27 @@ def test_rates_of_a_long_log_of_a_spinning_spacecraft_fit_its_attitudes(unit, is
         telemetry.measurements(loaded(rate_unit=unit), pl.DataFrame(columns))
 
 
+def slow_log(noise, outliers):
+    """Return a log of a slow slew with `noise`, 1 sigma of the attitude [rad], and outliers of attitude and rate."""
+    rng, t = np.random.default_rng(0), np.arange(400) / 2.0
+    axis = np.array([0.01, 0.005, -0.003])
+    angle, rate = 0.3 * t - 0.3 * np.sin(t / 10.0), 0.3 - 0.03 * np.cos(t / 10.0)
+    attitude = Rotation.from_rotvec(angle[:, None] * axis) * Rotation.from_rotvec(noise * rng.standard_normal((400, 3)))
+    rates, q = rate[:, None] * axis + 1e-4 * rng.standard_normal((400, 3)), attitude.as_quat()
+    wrong, also_wrong = np.split(rng.choice(400, 2 * outliers, replace=False), 2)
+    q[wrong] = (attitude[wrong] * Rotation.from_rotvec(0.1 * rng.standard_normal((outliers, 3)))).as_quat()
+    rates[also_wrong] += 0.1 * rng.standard_normal((outliers, 3))
+    columns = {"t": t} | {f"measured_q{k + 1}": q[:, k] for k in range(4)}
+    columns |= {f"measured_w{k + 1}": rates[:, k] for k in range(3)} | {f"sent{k + 1}": 0.0 * t for k in range(3)}
+    return pl.DataFrame(columns)
+
+
+def test_a_log_of_a_slow_slew_with_outliers_is_accepted():
+    """Only the outliers turn by enough for a comparison with the rates."""
+    log = telemetry.measurements(loaded(), slow_log(1e-4, outliers=9))
+    assert len(log.t) >= 390
+
+
 @pytest.mark.parametrize(
     ("table", "words"),
     [
