@@ -27,6 +27,8 @@ MIN_ROWS = 10  # smallest number of rows of a log
 NORM_TOLERANCE = 1e-3  # largest error of the norm of a quaternion: telemetry often has few digits
 MAX_GYRO_DIFFERENCE = 0.5  # largest median difference between attitude and gyro, relative to the rotation
 OUTLIER_RATIO = 10.0  # third difference of an outlier, relative to the median
+MIN_TURN = 0.02  # smallest rotation of a part of a log in which attitude and gyro are compared [rad]
+MIN_TURN_TO_NOISE = 10.0  # smallest ratio of this rotation to the noise of an attitude
 COMPARED_PARTS = 400  # number of parts of a log in which attitude and gyro are compared
 Values = np.ndarray
 
@@ -303,8 +305,9 @@ def _check_rates_match_attitudes(table: _Table, t: Values, readings: dict[str, V
     """Raise RefusedError if the attitudes and the rates describe different motions.
 
     The sum of the rotations from sample to sample over each part of the log is compared with the integral of the rate.
-    Parts that turn by less than 0.02 rad, or by more than 0.5 rad between two samples, are ignored. Medians of three
-    readings replace the readings, so that a part with an outlier does not seem to turn.
+    Parts that turn by less than `MIN_TURN`, by little compared with the noise of the attitudes, or by more than 0.5 rad
+    between two samples, are ignored. Medians of three readings replace the readings, so that a part with an outlier
+    does not seem to turn.
     """
     if set(readings) != {"attitude", "rate"}:
         return
@@ -320,11 +323,13 @@ def _check_rates_match_attitudes(table: _Table, t: Values, readings: dict[str, V
     integral = np.concatenate([np.zeros((1, 3)), np.cumsum(increments, axis=0)])[common_rows]
     attitudes = Rotation.from_quat(q[common_rows])
     rotations = (attitudes[:-1].inv() * attitudes[1:]).as_rotvec()
-    turns = median_filter(np.concatenate([np.zeros((1, 3)), np.cumsum(rotations, axis=0)]), (3, 1))
+    turns = np.concatenate([np.zeros((1, 3)), np.cumsum(rotations, axis=0)])
+    noise = 1.4826 * np.median(np.abs(np.diff(turns, 3, axis=0))) / np.sqrt(20.0)  # of normal noise, 1 sigma
+    turns = median_filter(turns, (3, 1))
     turn, rate_turn = (np.diff(values[part_ends], axis=0) for values in (turns, integral))
     largest_step = np.maximum.reduceat(np.linalg.norm(rotations, axis=1), part_ends[:-1])
     angle, difference = np.linalg.norm(turn, axis=1), np.linalg.norm(turn - rate_turn, axis=1)
-    is_comparable = (angle > 0.02) & (largest_step < 0.5)
+    is_comparable = (angle > max(MIN_TURN, MIN_TURN_TO_NOISE * noise)) & (largest_step < 0.5)
     if is_comparable.sum() < 5:
         return
     median_ratio = np.median(difference[is_comparable] / angle[is_comparable])

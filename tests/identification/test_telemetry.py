@@ -173,9 +173,10 @@ def slow_log(noise, outliers):
     return pl.DataFrame(columns)
 
 
-def test_a_log_of_a_slow_slew_with_outliers_is_accepted():
-    """Only the outliers turn by enough for a comparison with the rates."""
-    log = telemetry.measurements(loaded(), slow_log(1e-4, outliers=9))
+@pytest.mark.parametrize(("noise", "outliers"), [(1e-4, 9), (0.01, 0)])
+def test_a_log_of_a_slow_slew_with_outliers_or_coarse_attitudes_is_accepted(noise, outliers):
+    """Only errors of the attitude turn by more than 0.02 rad from sample to sample."""
+    log = telemetry.measurements(loaded(), slow_log(noise, outliers))
     assert len(log.t) >= 390
 
 
