@@ -349,7 +349,7 @@ def _correct(
             applied_gain = jnp.where(is_valid, 1.0 / variance, 0.0) * gain
             new_correction = new_correction + applied_gain * value
             new_p = new_p - applied_gain[:, None] * gain[None, :]
-        accepted = square <= gate * size
+        accepted = ~(square > gate * size)  # NaN is no outlier, so that the likelihood of an overflow is not finite
         accepted_components += [valid[k] & accepted for k in range(begin, begin + size)]
         correction, p = guards.select(accepted, (new_correction, new_p), (correction, p))
     p = 0.5 * (p + p.T)

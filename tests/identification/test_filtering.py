@@ -183,11 +183,13 @@ def test_noise_on_the_acceleration_moves_the_modes_too():
     np.testing.assert_allclose(variance, 0.3**2 * 1e-3 * np.sum(coupling**2, axis=1), rtol=1e-2)
 
 
-def test_a_search_from_a_motion_that_overflows_ends_without_an_estimate():
+@pytest.mark.parametrize(("gate", "coordinate"), [(np.inf, 300.0), (10.0, 2000.0)])
+def test_a_search_from_a_motion_that_overflows_ends_without_an_estimate(gate, coordinate):
+    """The frequency is 3e26 rad/s, or infinite. An earlier version rejected all readings of the second motion."""
     problem, log = flexible_body()
     problem = replace(problem, model=replace(problem.model, hidden_sigma=1e-3 * jnp.ones(4)))
-    search = estimation.Search(problem, [log], np.inf, lambda text: None)
-    start = np.append(np.zeros(6), [300.0, 0.0])  # a frequency of 3e26 rad/s
+    search = estimation.Search(problem, [log], gate, lambda text: None)
+    start = np.append(np.zeros(6), [coordinate, 0.0])
     found = search.search_locally(start, 0.0)
     assert not found.converged
     assert found.log_likelihood == -np.inf
