@@ -511,7 +511,8 @@ def _newton_step(gradient: np.ndarray, information: np.ndarray, damping: float =
 
 
 def _more_likely(*results: SearchResult) -> SearchResult:
-    return max(results, key=lambda result: result.log_likelihood)
+    """Return the most likely result. Noise on the acceleration is kept only for a gain of `NOISE_GAIN`."""
+    return max(results, key=lambda result: result.log_likelihood - NOISE_GAIN * (result.acceleration_noise > 0.0))
 
 
 def _is_finite(derivatives: tuple[float, np.ndarray, np.ndarray, float]) -> bool:

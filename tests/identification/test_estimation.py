@@ -1,5 +1,6 @@
 """Estimates of `ptsmc identify` from logs of an independent simulation, and the identified scenario."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -160,6 +161,37 @@ def test_a_wrong_model_does_not_reject_correct_readings_and_has_wide_intervals(d
     assert found.fits[0].outlier_count == 0
     assert np.all(np.abs(found.estimate - ENTRIES) < 3.5 * found.std)
     assert "free disturbance_phase, which [dispersion] varies" in found.verdict[0]
+
+
+class ScriptedSearch(estimation.Search):
+    """A search of one phase with given results of the local searches."""
+
+    def __init__(self, local, mirrored):
+        problem: Any = SimpleNamespace(
+            phases=[0], labels=["disturbance_phase"], parameters=[], size=1, has_prior=lambda: np.zeros(1),
+            mirror_phase=lambda z, k: np.pi - z, numbers=lambda z: z,
+        )  # fmt: skip
+        super().__init__(problem, [], np.inf, lambda text: None)
+        self.local, self.mirrored = list(local), list(mirrored)
+
+    def search_locally(self, z, acceleration):
+        result = self.local.pop(0)
+        self.acceleration_noise = result.acceleration_noise
+        return result
+
+    def _screen_and_maximise(self, z, screenings=1, tolerance=1e-3):
+        return self.mirrored.pop(0)
+
+
+def local_result(phase, log_likelihood, noise=0.0):
+    return estimation.SearchResult(np.array([phase]), log_likelihood, np.eye(1), 1.0, True, 1, noise)
+
+
+@pytest.mark.parametrize(("gain", "noise"), [(5.0, 0.0), (9.0, 0.1)])
+def test_noise_on_the_acceleration_is_kept_only_for_a_large_gain_of_the_likelihood(gain, noise):
+    noisy, quiet = local_result(0.4, 100.0 + gain, 0.1), local_result(0.4, 100.0)
+    search = ScriptedSearch([noisy, quiet], 2 * [local_result(2.7, 0.0)])
+    assert search.find_best(np.zeros(1), 1.0, 2).acceleration_noise == noise
 
 
 def test_intervals_are_wider_if_innovations_are_not_white():
