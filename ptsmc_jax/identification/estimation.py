@@ -261,6 +261,7 @@ class SearchResult(NamedTuple):
     converged: bool
     steps: int
     acceleration_noise: float  # of the filter [rad/s^1.5]
+    ambiguities: Sequence[str] = ()  # a sentence for each phase whose mirrored value is about as likely
 
 
 class Search:
@@ -272,7 +273,6 @@ class Search:
         self.prior_weight = problem.has_prior().astype(float)
         self._noise_is_free = any(parameter.name.endswith("_noise") for parameter in problem.parameters)
         self.acceleration_noise = 0.0  # of the filter [rad/s^1.5]
-        self.ambiguities: list[str] = []  # a sentence for each phase whose mirrored value is about as likely
         self._jitted_filter = jax.jit(
             lambda z, noise, rows, kind: filtering.run_filter(self._model_at(z, noise), rows, kind),
             static_argnames="kind",
@@ -371,7 +371,9 @@ class Search:
             if best.acceleration_noise == 0.0 and best.mean_square < self.largest_mean_square:
                 break
             self.report(f"the fit is poor; starting point {k + 1}")
-            best = _more_likely(best, self.search_locally(draws.standard_normal(self.problem.size), acceleration))
+            other = self.search_locally(draws.standard_normal(self.problem.size), acceleration)
+            if _more_likely(best, other) is other:
+                best = self._mirror_phases(other)
         self.acceleration_noise = best.acceleration_noise
         return best
 
@@ -382,14 +384,14 @@ class Search:
             self.report("the mirrored phases of the disturbance")
             others = [self._screen_and_maximise(self.problem.mirror_phase(best.z, k)) for k in phases]
             if _more_likely(*others).log_likelihood < best.log_likelihood + 1.0:
-                self.ambiguities = [
+                ambiguities = [
                     f"the data do not tell {self.problem.labels[k]} from its mirrored value"
                     for k, other in zip(phases, others, strict=True)
                     if other.log_likelihood > best.log_likelihood - MIRROR_GAIN
                     and abs(parameters.wrap_angle((self.problem.numbers(other.z) - self.problem.numbers(best.z))[k]))
                     > 0.1
                 ]
-                break
+                return best._replace(ambiguities=ambiguities)
             best = _more_likely(*others)
             if self.acceleration_noise > 0.0:  # the phase may have been the only error of the model
                 self.acceleration_noise = 0.0
@@ -608,9 +610,9 @@ def _build_result(
         covariance=by_z @ z_covariance @ by_z.T,
         undetermined=[
             *describe_undetermined(problem, best.information - np.diag(search.prior_weight), by_start),
-            *search.ambiguities,
+            *best.ambiguities,
         ],
-        is_determined=bool(np.min(np.linalg.eigvalsh(best.information)) >= 1.0) and not search.ambiguities,
+        is_determined=bool(np.min(np.linalg.eigvalsh(best.information)) >= 1.0) and not best.ambiguities,
         variance_factor=variance_factor,
         fits=fits,
         validation=[fit_log(log, is_validation=True) for log in validation_logs],

@@ -183,8 +183,8 @@ class ScriptedSearch(estimation.Search):
         return self.mirrored.pop(0)
 
 
-def local_result(phase, log_likelihood, noise=0.0):
-    return estimation.SearchResult(np.array([phase]), log_likelihood, np.eye(1), 1.0, True, 1, noise)
+def local_result(phase, log_likelihood, noise=0.0, mean_square=1.0):
+    return estimation.SearchResult(np.array([phase]), log_likelihood, np.eye(1), mean_square, True, 1, noise)
 
 
 @pytest.mark.parametrize(("gain", "noise"), [(5.0, 0.0), (9.0, 0.1)])
@@ -192,6 +192,14 @@ def test_noise_on_the_acceleration_is_kept_only_for_a_large_gain_of_the_likeliho
     noisy, quiet = local_result(0.4, 100.0 + gain, 0.1), local_result(0.4, 100.0)
     search = ScriptedSearch([noisy, quiet], 2 * [local_result(2.7, 0.0)])
     assert search.find_best(np.zeros(1), 1.0, 2).acceleration_noise == noise
+
+
+def test_phases_of_a_better_starting_point_are_mirrored_too():
+    first, second = local_result(0.4, 0.0, mean_square=9.0), local_result(-0.8, 100.0)
+    search = ScriptedSearch([first, second], [local_result(2.7, -1.0), local_result(-2.3, 200.0), second])
+    best = search.find_best(np.zeros(1), 1.0, 2)
+    assert best.z == -2.3
+    assert not best.ambiguities  # the mirrored phase of the first starting point is ambiguous
 
 
 def test_intervals_are_wider_if_innovations_are_not_white():
