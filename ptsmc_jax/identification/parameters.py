@@ -129,8 +129,17 @@ class Problem:
 
     @property
     def phases(self) -> list[int]:
-        """The indices of the phases of disturbances among the numbers."""
-        return [k for k, label in enumerate(self.labels) if label.startswith(PHASE)]
+        """The indices of the phases of sinusoids among the numbers.
+
+        The phase of a gravity gradient is absent: the torque has the period pi of the phase, and no mirrored value.
+        """
+        is_sinusoid = [
+            isinstance(term, disturbances.Sinusoid)
+            for term in disturbances.terms(self.model.disturbance)
+            for _ in range(disturbances.values(term, "phase").size)
+        ]
+        indices = [k for k, label in enumerate(self.labels) if label.startswith(PHASE)]
+        return [k for k, is_mirrored in zip(indices, is_sinusoid, strict=False) if is_mirrored]
 
     def mirror_phase(self, z: np.ndarray, k: int) -> np.ndarray:
         """Return coordinates (n,) with number k, a phase p, mirrored to pi - p.

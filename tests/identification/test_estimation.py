@@ -11,7 +11,7 @@ import pytest
 from ptsmc_jax import explore, formulas, scenario
 from ptsmc_jax.dispersions import numbers
 from ptsmc_jax.dispersions.quantities import PAIRS
-from ptsmc_jax.identification import estimation, filtering, results, telemetry
+from ptsmc_jax.identification import estimation, filtering, parameters, results, telemetry
 from ptsmc_jax.scenario import parsing
 from ptsmc_jax.scenario.errors import ScenarioError
 from tests.identification import synthetic
@@ -142,6 +142,16 @@ def test_dispersed_phases_are_estimated_by_default_and_not_confused_with_their_m
     written: Any = found.identified_scenario
     np.testing.assert_allclose(written.disturbance.phase, found.estimate[first:])
     assert written.dispersion.disturbance_phase is None
+
+
+def test_only_phases_of_sinusoids_are_mirrored(disturbed):
+    """Phases p and p + pi of a gravity gradient have the same torque, and p + pi is no mirror image."""
+    terms = [{"kind": "gravity_gradient"}, DISPERSED["disturbance"]]
+    loaded = satellite(("disturbance_phase",), disturbance={"kind": "sum", "terms": terms})
+    problem = parameters.build(loaded, [telemetry.measurements(loaded, disturbed)])
+    assert problem.labels == [f"disturbance_phase_{k}" for k in (1, 2, 3, 4)]
+    assert problem.phases == [1, 2, 3]
+    np.testing.assert_allclose(problem.numbers(problem.mirror_phase(np.zeros(4), 2)), [0.0, 0.0, -np.pi, 0.0])
 
 
 def test_a_phase_that_the_log_does_not_tell_from_its_mirror_image_is_named():
