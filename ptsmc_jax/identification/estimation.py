@@ -457,7 +457,7 @@ class Search:
     def reject_outliers(self, z: np.ndarray, log: PreparedLog) -> PreparedLog:
         """Return the log without its outliers at these coordinates.
 
-        The limit grows until few readings of each component exceed it, so that a poor model does not reject correct
+        The limit grows until few readings of each component exceed it, so that a poor model rejects few correct
         readings.
         """
         rows, kind = log

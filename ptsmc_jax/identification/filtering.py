@@ -45,7 +45,7 @@ class Model:
     bias_walk: Leaf  # density of the gyro bias's random walk [rad/s/sqrt(s)]
     walk_density: Leaf  # (m,) density of the random-walk torque [N m/sqrt(s)]
     hidden_sigma: Leaf  # (n,) prior 1 sigma of the states without a sensor, such as modal coordinates, at the first row
-    acceleration_noise: Leaf  # density of white noise on the acceleration; 0 except early in a search [rad/s^1.5]
+    acceleration_noise: Leaf  # density of white noise on the acceleration; 0 if the model explains the log [rad/s^1.5]
 
     @property
     def is_spacecraft(self) -> bool:
