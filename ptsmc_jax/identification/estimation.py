@@ -46,6 +46,7 @@ MAX_AUTOCORRELATION = 0.05  # largest autocorrelation that counts as white in a 
 MEAN_SQUARE_RANGE = (0.8, 1.25)  # mean normalised square of innovations that fit their variance, in a long log
 MISFIT_SIGMAS = 4.0  # in a short log, an autocorrelation or a mean square beyond this number of sigmas is a misfit
 MAX_DISTANCE = 3.0  # largest distance of the most likely parameters of a validation log, RMS in sigmas of the estimates
+ROUNDING_ERROR = 1e-3  # of the smallest eigenvalue of an information, which is 1 for prior knowledge alone
 CONFIDENCE = 0.95  # of the intervals of the estimates
 MIN_COMPONENT = 0.3  # smallest component of an undetermined direction whose parameter is named
 PreparedLog = tuple[Rows, LogKind]  # a log for the filter
@@ -533,6 +534,11 @@ def covariance(information: np.ndarray) -> np.ndarray:
     return (directions / np.maximum(sizes, 1.0)) @ directions.T
 
 
+def determines_all(information: np.ndarray) -> bool:
+    """Return whether the Fisher information (n, n) of data and prior knowledge determines every combination."""
+    return bool(np.min(np.linalg.eigvalsh(information)) >= 1.0 - ROUNDING_ERROR)
+
+
 def describe_undetermined(problem: Problem, information: np.ndarray, by_z: np.ndarray) -> list[str]:
     """Return a sentence for each combination of parameters that the data do not determine.
 
@@ -612,7 +618,7 @@ def _build_result(
             *describe_undetermined(problem, best.information - np.diag(search.prior_weight), by_start),
             *best.ambiguities,
         ],
-        is_determined=bool(np.min(np.linalg.eigvalsh(best.information)) >= 1.0) and not best.ambiguities,
+        is_determined=determines_all(best.information) and not best.ambiguities,
         variance_factor=variance_factor,
         fits=fits,
         validation=[fit_log(log, is_validation=True) for log in validation_logs],
