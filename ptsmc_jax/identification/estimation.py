@@ -155,7 +155,7 @@ class Identification:
     covariance: np.ndarray  # covariance of the estimated numbers (k, k)
     undetermined: list[str]  # sentences on combinations that the data do not determine
     is_determined: bool  # whether data and prior knowledge together determine every parameter
-    variance_factor: float  # ratio of the covariance to the Cramer-Rao bound, see `Fit.variance_factor`
+    variance_factor: float  # largest ratio of the covariance to the Cramer-Rao bound, see `Fit.variance_factor`
     fits: list[Fit]  # fits of the logs
     validation: list[Fit]  # fits of the validation logs
     converged: bool  # whether the search that ended at z converged
@@ -534,6 +534,18 @@ def covariance(information: np.ndarray) -> np.ndarray:
     return (directions / np.maximum(sizes, 1.0)) @ directions.T
 
 
+def inflated_covariance(information: np.ndarray, prior: np.ndarray, variance_factor: float) -> np.ndarray:
+    """Return the covariance (n, n) of the coordinates if the innovations are not white.
+
+    Args:
+        information: Fisher information (n, n) of data and prior knowledge.
+        prior: information (n, n) of the prior knowledge, whose errors are not larger than expected.
+        variance_factor: ratio of the variance of the gradient of the data's log-likelihood to its expected value [-].
+    """
+    white = covariance(information)
+    return white + (variance_factor - 1.0) * white @ (information - prior) @ white
+
+
 def determines_all(information: np.ndarray) -> bool:
     """Return whether the Fisher information (n, n) of data and prior knowledge determines every combination."""
     return bool(np.min(np.linalg.eigvalsh(information)) >= 1.0 - ROUNDING_ERROR)
@@ -605,7 +617,7 @@ def _build_result(
 
     fits = [fit_log(log) for log in logs]
     variance_factor = max(fit.variance_factor for fit in fits)
-    z_covariance = covariance(best.information / variance_factor)
+    z_covariance = inflated_covariance(best.information, np.diag(search.prior_weight), variance_factor)
     return Identification(
         scenario=loaded,
         problem=problem,

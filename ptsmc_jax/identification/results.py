@@ -232,7 +232,7 @@ def verdict(identification: Identification) -> list[str]:
             lines.append(f"{fit.outlier_count} readings of {name} are outliers and were not used")
     if identification.variance_factor > 1.0:
         widening = float(np.sqrt(identification.variance_factor))
-        lines.append(f"all intervals are {widening:.3g} times as wide as for white innovations")
+        lines.append(f"the intervals are up to {widening:.3g} times as wide as for white innovations")
     if not identification.converged:
         lines.append("the search did NOT converge; its estimates are preliminary")
     return [*lines, *identification.undetermined]

@@ -282,6 +282,16 @@ def test_every_value_of_the_coordinates_is_the_inertia_of_a_body():
     np.testing.assert_allclose(numbers.from_coordinates(root, jnp.zeros(6)), np.diag([0.05, 0.09, 0.1399]), rtol=1e-12)
 
 
+def test_the_variance_of_the_data_but_not_of_prior_knowledge_is_inflated():
+    data, factor = np.array([1e-9, 0.5, 50.0, 1e4]), 100.0
+    # variance of the mean of a measurement with variance factor / data and of prior knowledge with variance 1
+    expected = (data**2 * (factor / data) + 1.0) / (data + 1.0) ** 2
+    found = estimation.inflated_covariance(np.diag(data + 1.0), np.eye(4), factor)
+    np.testing.assert_allclose(found, np.diag(expected), rtol=1e-12, atol=1e-12)
+    without_prior = estimation.inflated_covariance(np.diag(data), np.zeros((4, 4)), factor)
+    np.testing.assert_allclose(np.diag(without_prior)[2:], factor / data[2:])
+
+
 def test_prior_knowledge_determines_what_the_data_do_not():
     """An earlier version denied this in every other case, because of rounding errors."""
     for seed in range(20):
