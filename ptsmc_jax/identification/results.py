@@ -124,7 +124,7 @@ def _write_disturbance(
             begin += size
         if quantity == "amplitude":
             dispersion[name] = relative
-        elif np.max(std) < 1.0:
+        elif np.max(std) < 1.0 and not any(name in sentence for sentence in identification.undetermined):
             dispersion.pop(name, None)  # the phase is no longer random
     tables["disturbance"] = terms[0] if len(terms) == 1 else {"kind": "sum", "terms": terms}
 
