@@ -37,7 +37,7 @@ ACCELERATION_NOISES = (0.3, 0.03, 0.003, 0.0003)  # noise in a search, relative 
 NOISE_GAIN = 8.0  # smallest gain of the log-likelihood for which noise on the acceleration is kept: 4 sigma
 MIRROR_GAIN = 8.0  # smallest gain of the log-likelihood that tells a phase from its mirrored value
 MAX_SCREENINGS = 4  # largest number of searches for outliers, each followed by a search for the parameters
-MAX_OUTLIER_FRACTION = 0.05  # largest fraction of the readings of a component that are rejected as outliers
+MAX_OUTLIER_FRACTION = 0.2  # largest fraction of the readings of a component that are rejected as outliers
 MIN_OUTLIERS = 3  # number of outliers of a component that are allowed in a short log
 GATE_GROWTHS = (*np.logspace(0.0, 8.0, 9), np.inf)  # factors of the limit of outliers, if it rejects more readings
 POOR_FIT = 1.5  # median normalised square of innovations above which a search begins with noise
@@ -458,8 +458,8 @@ class Search:
     def reject_outliers(self, z: np.ndarray, log: PreparedLog) -> PreparedLog:
         """Return the log without its outliers at these coordinates.
 
-        The limit grows until few readings of each component exceed it, so that a poor model rejects few correct
-        readings.
+        The limit grows until at most `MAX_OUTLIER_FRACTION` of the readings of each component exceed it, so that a poor
+        model cannot reject most of the correct readings.
         """
         rows, kind = log
         accepted = valid = rows.valid[1:]

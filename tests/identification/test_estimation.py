@@ -58,6 +58,15 @@ def test_outliers_and_missing_samples_do_not_spoil_the_estimates(identified):
     assert found.fits[0].outlier_count >= 10  # 18 components were spoiled, some in rows that are blank
 
 
+def test_a_tenth_of_outliers_does_not_spoil_the_estimates():
+    """Regression: if more than 5 % of the readings of a sensor were outliers, none was rejected."""
+    rng = np.random.default_rng(6)
+    found = explore.identify(satellite(), synthetic.spoiled(flight(rng)[0], rng, outliers=0.1, missing=0.0))
+    assert found.fits[0].outlier_count > 100  # 156 components were spoiled
+    assert np.all(np.abs(found.estimate - ENTRIES) < 3.5 * found.std)  # all of six within 3.5 sigma: 99.7 %
+    assert np.all(found.std < 0.02 * 0.11)  # the start is 30 % off
+
+
 def test_a_log_that_was_not_used_is_predicted(identified):
     found, _ = identified
     (fit,) = found.validation
