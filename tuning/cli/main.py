@@ -173,7 +173,7 @@ def margins(
     They are computed in the hold phase and in the frozen approach phase. The nominal loop has no dispersions. `tune`
     and `montecarlo` judge required margins by the worst dispersed loop.
 
-    Exit status: 0 stable in the hold phase, 1 not stable in the hold phase, 2 configuration error.
+    Exit status: 0 stable in the hold phase, 1 not stable or open in the hold phase, 2 configuration error.
     """
     loaded, folder = prepare(scenario, "margins", out, trust=common.trust, force=common.force)
     from ptsmc_jax.campaigns import store
@@ -187,7 +187,7 @@ def margins(
     summary = stability.summary(ready, course)
     if not common.quiet:
         terminal.print_result("margins", summary, loaded.plant.kind, folder)
-    return 0 if summary["stable"] else 1
+    return 0 if summary["stable"] and not summary["open"] else 1
 
 
 @app.command
