@@ -96,8 +96,9 @@ def signals(t: np.ndarray, panels: list[Panel]) -> Figure:
             panel.plot(t[drawn], predicted[drawn, k], "-", lw=0.9, color=colour, label=f"component {k + 1}")
         low, high = panel.get_ylim()
         row, column = np.nonzero(rejected)
-        panel.plot(t[row], np.clip(measured[row, column], low, high), clip_on=False, **REJECTED)
-        panel.set_ylim(low, high)
+        if row.size:
+            panel.plot(t[row], np.clip(measured[row, column], low, high), clip_on=False, **REJECTED)
+            panel.set_ylim(low, high)
     if any(np.any(rejected) for *_, rejected in panels):
         axes[0].plot([], [], **REJECTED, label="rejected")
     style.legend_below(figure, columns=6)

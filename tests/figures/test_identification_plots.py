@@ -6,11 +6,11 @@ from ptsmc_jax.figures import identification_plots
 
 
 def test_signals_show_every_component_and_a_legend_below_them():
-    """An earlier version drew five components, and its legend covered the title."""
+    """Earlier versions drew five components, their legend covered the title, and plots had hardly any height."""
     t, values = np.arange(5.0), np.ones((5, 7))
-    figure = identification_plots.signals(t, [("state", values, values, values > 1.0)])
-    figure.draw_without_rendering()
-    (axes,), (legend,) = figure.axes, figure.legends
+    figure = identification_plots.signals(t, [("state", values, values, values > 1.0)] * 2)
+    figure.draw_without_rendering()  # warns if the layout leaves no height for the plots
+    (_, axes), (legend,) = figure.axes, figure.legends
     assert len(legend.get_texts()) == 7
     assert legend.get_window_extent().y1 < axes.get_window_extent().y0
 
