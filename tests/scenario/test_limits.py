@@ -132,7 +132,7 @@ def test_report_states_the_deciding_value_relative_to_the_limit():
         one = Requirement("peak_torque", 0.5, quantile=quantile).verdict(values, np.ones(4, bool))
         return report.per_cent_of_limit(examples.entry(one))
 
-    assert told(0.75) == "; 90 % of the limit"
+    assert told(0.75) == "; the deciding trial is at 90 % of the limit"
     assert told(None) == "; 140 % of the limit"
     timed = Requirement("ape_x", 0.02, quantile=0.9, interpretation="temporal")
     of_time = timed.verdict(np.full(50, 0.03), np.ones(50, bool), np.full(50, 0.98))

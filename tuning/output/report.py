@@ -137,7 +137,8 @@ def per_cent_of_limit(entry: "Entry") -> str:
         return ""
     if entry.fraction_of_time is not None:
         return f"; {format_ratio(100 * entry.margin)} % of the time allowed beyond the limit"
-    return f"; {format_ratio(100 * entry.margin)} % of the limit"
+    subject = "" if entry.quantile is None else "the deciding trial is at "
+    return f"; {subject}{format_ratio(100 * entry.margin)} % of the limit"
 
 
 def bound_lines(value: float | None, lower_bound: float | None, plant: str) -> Iterator[str]:
