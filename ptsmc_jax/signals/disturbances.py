@@ -50,7 +50,7 @@ class Disturbance:
 @pytree
 @dataclass(frozen=True)
 class Constant(Disturbance):
-    """A constant disturbance. The value zero means no disturbance."""
+    """A constant disturbance, of a spacecraft in body axes. The value zero means no disturbance."""
 
     amplitude: Leaf = number(
         Scaled(0.01, inertia=1, order=-1, each=True), unit="unit of d", each=True,
@@ -95,7 +95,7 @@ def _sin_cos_of_sum(angle: Array, phase: Leaf) -> tuple[Array, Array]:
 @pytree
 @dataclass(frozen=True)
 class Sinusoid(Disturbance):
-    """The disturbance bias + amplitude sin(frequency t + phase), component by component."""
+    """The disturbance bias + amplitude sin(frequency t + phase) of each component, of a spacecraft in body axes."""
 
     amplitude: Leaf = number(
         Scaled(0.01, inertia=1, order=-1, each=True), unit="unit of d", each=True,
