@@ -200,7 +200,7 @@ def _case_i(plant: str) -> Mapping[str, Mapping[str, Any]]:
 
 
 def _dispersion(struct: type[Table], unit_of_d: str) -> Iterator[str]:
-    """Yield a table of the keys, and a table of their kinds, many of which several keys have."""
+    """Yield a table of the keys, and a table of their kinds. Several keys may have the same kind."""
     rows, users = [], dict[tuple[str, type[Table]], list[str]]()
     for key in keys.list_keys(struct):
         names = [f'`"{kind}"`' for kind in layouts.DISPERSIONS[key.name]]

@@ -112,14 +112,7 @@ def contract(eqn: Any, operands: Sequence[jax.Array]) -> Sequence[jax.Array]:
     XLA's CPU compiler aborts the process for some batches of `dot_general`, for example of derivatives.
     """
     out = eqn.outvars[0].aval
-
-    def group_axes(array: jax.Array, axes: Sequence[int], batch: Sequence[int]) -> jax.Array:
-        """Return the array as (batch, kept, contracted)."""
-        kept = [a for a in range(array.ndim) if a not in (*axes, *batch)]
-        sizes = [math.prod(array.shape[a] for a in group) for group in (batch, kept, axes)]
-        return array.astype(out.dtype).transpose([*batch, *kept, *axes]).reshape(sizes)
-
-    a, b = (group_axes(*each) for each in zip(operands, *eqn.params["dimension_numbers"], strict=True))
+    a, b = _grouped_operands(eqn, [operand.astype(out.dtype) for operand in operands])
     return [jnp.sum(a[:, :, None] * b[:, None], axis=-1).astype(out.dtype).reshape(out.shape)]
 
 
@@ -308,6 +301,17 @@ def reduce_entries(eqn: Any, array: np.ndarray, fold: Callable[[np.ndarray], Any
     return object_array(shape, (fold(rows[i]) for i in np.ndindex(*shape)))
 
 
+def _grouped_operands(eqn: Any, operands: Sequence[Any]) -> list[Any]:
+    """Return both operands of a `dot_general`, arrays of JAX or of objects, as (batch, kept, contracted)."""
+
+    def group_axes(array: Any, axes: Sequence[int], batch: Sequence[int]) -> Any:
+        kept = [a for a in range(array.ndim) if a not in (*axes, *batch)]
+        sizes = [math.prod(array.shape[a] for a in group) for group in (batch, kept, axes)]
+        return array.transpose([*batch, *kept, *axes]).reshape(sizes)
+
+    return [group_axes(*each) for each in zip(operands, *eqn.params["dimension_numbers"], strict=True)]
+
+
 def contract_entries(eqn: Any, left: np.ndarray, right: np.ndarray, inner: Callable[..., Any]) -> np.ndarray:
     """Return the result of a `dot_general` on object arrays.
 
@@ -317,14 +321,7 @@ def contract_entries(eqn: Any, left: np.ndarray, right: np.ndarray, inner: Calla
         right: its second operand.
         inner: function from a row (n,) and a column (n,) to their scalar product.
     """
-
-    def group_axes(array: np.ndarray, axes: Sequence[int], batch: Sequence[int]) -> np.ndarray:
-        """Return the array as (batch, kept, contracted)."""
-        kept = [a for a in range(array.ndim) if a not in (*axes, *batch)]
-        sizes = [math.prod(array.shape[a] for a in group) for group in (batch, kept, axes)]
-        return array.transpose([*batch, *kept, *axes]).reshape(sizes)
-
-    a, b = (group_axes(*each) for each in zip((left, right), *eqn.params["dimension_numbers"], strict=True))
+    a, b = _grouped_operands(eqn, (left, right))
     indices = itertools.product(range(len(a)), range(a.shape[1]), range(b.shape[1]))
     return object_array(eqn.outvars[0].aval.shape, (inner(a[k, i], b[k, j]) for k, i, j in indices))
 

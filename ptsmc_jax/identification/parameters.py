@@ -20,7 +20,7 @@ from ptsmc_jax.devices.actuators import Actuators
 from ptsmc_jax.dispersions import numbers
 from ptsmc_jax.dispersions.quantities import PAIRS
 from ptsmc_jax.identification.filtering import Model
-from ptsmc_jax.identification.telemetry import Measurements
+from ptsmc_jax.identification.telemetry import Measurements, estimate_noise
 from ptsmc_jax.numerics import attitude, matrices, paths
 from ptsmc_jax.numerics.pytrees import vector
 from ptsmc_jax.plants.rigid_body import AttitudeState
@@ -273,13 +273,13 @@ def _usual_rate(log: Measurements) -> float:
 
 
 def _estimate_noise(name: str, log: Measurements) -> np.ndarray:
-    """Return a robust estimate of the noise from third differences. They have 20 times the variance of the noise."""
+    """Return an estimate of the noise of a sensor in a log, see `telemetry.estimate_noise`."""
     values = log.readings[name]
     has_reading = ~np.isnan(values).any(axis=1)
     values = 2.0 * values[has_reading] if name == "attitude" else values[has_reading]
     if len(values) < 8:
         return np.full(3 if name != "x" else values.shape[1], 1e-3)
-    noise = 1.4826 * np.median(np.abs(np.diff(values, 3, axis=0)), axis=0) / np.sqrt(20.0)
+    noise = estimate_noise(values, axis=0)
     return np.full(3, np.max(noise)) if name != "x" else np.maximum(noise, 1e-9 * (1e-3 + np.ptp(values, axis=0)))
 
 

@@ -94,7 +94,7 @@ def _error_at_and_after_t_f(run: Run) -> tuple[float, float]:
 
 
 def _time_to_one_percent(run: Run) -> float:
-    """Return the time from which the error stays at or below 1 % of the initial error, at a sample [s]."""
+    """Return the first sample time after which the error is never above 1 % of the initial error [s]."""
     size = np.linalg.norm(run.log.error, axis=1)
     return float(run.log.t[np.flatnonzero(size > 0.01 * size[0])[-1] + 1])
 
