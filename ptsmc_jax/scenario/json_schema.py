@@ -28,7 +28,7 @@ def _plant_schema(kind: str, scenario: type[Scenario]) -> Schema:
         tables["sensors"] = {"anyOf": [tables["sensors"], sensor_list]}
     tables["plant"]["required"] = ["kind"]
     tables["plant"]["properties"]["kind"] = {"const": kind}
-    limit = _allow_unit_text(_value_schema(NotNegative), {})
+    limit = _allow_unit_text(_value_schema(NotNegative))
     limit_table = _table_schema(Limit, scenario.unit_of_d)
     limit_table["properties"]["limit"] = limit
     limit_or_table = {"anyOf": [limit, limit_table | {"required": ["limit"]}]}
@@ -65,7 +65,7 @@ def _table_schema(struct: type[Table], unit_of_d: str, name: str = "") -> Schema
         inline = layouts.KINDS.get(f"{name}.{key.name}")
         schema = _value_schema(key.type) if inline is None else _kinds_schema("", inline, unit_of_d)
         if key.unit in catalogues.UNITS:
-            schema = _allow_unit_text(schema, schema.pop("items", {}))
+            schema = _allow_unit_text(schema)
         if isinstance(key.default, bool | int | float | str):
             schema["default"] = key.default
         properties[key.name] = schema | {"description": key.text if inline else f"{key.text}: {key.allowed}"}
@@ -87,8 +87,11 @@ def _value_schema(hint: Any) -> Schema:
     return value
 
 
-def _allow_unit_text(number: Schema, items: Schema) -> Schema:
-    """Return the schema of a number, or of a list of numbers, and allow texts with a unit as numbers."""
-    if items:
-        return {**number, "items": {"anyOf": [items, {"type": "string"}]}}
-    return {"anyOf": [number, {"type": "string"}]}
+def _allow_unit_text(schema: Schema) -> Schema:
+    """Return the schema of a number, or of a list or a matrix of numbers, and allow texts with a unit as numbers."""
+    if "prefixItems" in schema:  # a row of a matrix
+        return {**schema, "prefixItems": [*map(_allow_unit_text, schema["prefixItems"])]}
+    if "items" in schema:
+        return {**schema, "items": _allow_unit_text(schema["items"])}
+    alternatives = [_allow_unit_text(one) if "items" in one else one for one in schema.get("anyOf", [schema])]
+    return {"anyOf": [*alternatives, {"type": "string"}]}

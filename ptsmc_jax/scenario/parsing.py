@@ -428,7 +428,7 @@ def _parse_value(key: str, value: object, value_type: Any, unit: str = "") -> An
 def _hint(key: str, value: object, unit: str, allowed: str) -> str:
     """Return a hint for a value that is not allowed: how its unit, a whole number or a noise per axis is written."""
     units = catalogues.UNITS.get(unit, {})
-    entries = value if isinstance(value, tuple) else (value,)
+    entries = np.ravel(np.array(value, dtype=object))
     if units and any(isinstance(one, str | Mapping) for one in entries):
         return f" [{unit}], or with a unit such as {catalogues.EXAMPLES[unit]}, in {', '.join(units)}"
     if any(_split_number(one)[1] for one in entries):

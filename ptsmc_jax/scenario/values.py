@@ -23,7 +23,7 @@ Matrix = Annotated[tuple[Three, Three, Three], Meta(description="three rows of t
 Interval = Annotated[tuple[float, float], Meta(description="two numbers, the lower bound first")]
 Inertia = Annotated[
     tuple[int | float | tuple[int | float, ...], ...],
-    Meta(description="three principal moments or a symmetric 3x3 tensor [kg m^2]"),
+    Meta(description="three principal moments or a symmetric 3x3 tensor"),
 ]
 Quantile = Annotated[float, Meta(gt=0, lt=1, description="a number between 0 and 1")]
 

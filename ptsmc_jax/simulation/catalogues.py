@@ -52,6 +52,7 @@ UNITS: dict[str, dict[str, float]] = {
     "N m/s": {"N m/s": 1.0, "mN m/s": 1e-3, "uN m/s": 1e-6, "Nm/s": 1.0, "mNm/s": 1e-3, "uNm/s": 1e-6},
     "s": {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0},
     "m": {"m": 1.0, "km": 1e3},
+    "kg m^2": {"kg m^2": 1.0, "kg cm^2": 1e-4, "kg mm^2": 1e-6, "g m^2": 1e-3, "g cm^2": 1e-7, "g mm^2": 1e-9},
     "sqrt(kg) m": {"sqrt(kg) m": 1.0},
     "deg": {"deg": 1.0, "rad": 180 / math.pi},
     "dB": {"dB": 1.0},
@@ -60,7 +61,8 @@ UNITS: dict[str, dict[str, float]] = {
 EXAMPLES = {
     "rad": '"10 arcsec" or "0.5 deg"', "rad/s": '"0.3 deg/h" or "2 deg/s"', "rad/s/sqrt(Hz)": '"0.02 deg/sqrt(h)"',
     "rad/s/sqrt(s)": '"0.1 deg/h/sqrt(h)"', "N m": '"5 mN m"', "N m s": '"20 mN m s"', "N m/s": '"1 mN m/s"',
-    "s": '"200 ms" or "2 min"', "m": '"500 km"', "sqrt(kg) m": '"0.8 sqrt(kg) m"', "deg": '"30 deg"', "dB": '"6 dB"',
+    "s": '"200 ms" or "2 min"', "m": '"500 km"', "kg m^2": '"350 kg cm^2"',
+    "sqrt(kg) m": '"0.8 sqrt(kg) m"', "deg": '"30 deg"', "dB": '"6 dB"',
 }  # fmt: skip
 CATALOGUES = {"spacecraft": CATALOGUE, "chain": STATE_CATALOGUE, "system": STATE_CATALOGUE}  # by the kind of the plant
 ANGLE_UNITS = {"spacecraft": "rad", "chain": "x1", "system": "x1"}  # unit of the column `initial_angle`

@@ -67,6 +67,8 @@ def test_every_unit_has_an_example_for_error_messages():
         ("disturbance", "amplitude", ["1 mN m", 0.0, "20 uN m"], (1e-3, 0.0, 2e-5)),
         ("disturbance", "amplitude", ("1 mN m", 0.0, "20 uNm"), (1e-3, 0.0, 2e-5)),
         ("disturbance", "frequency", ["0.5 Hz", "3 rpm", 1.0], (np.pi, np.pi / 10.0, 1.0)),
+        ("spacecraft", "inertia", ["300 kg cm^2", "2e5 g cm^2", "40 g m^2"], (0.03, 0.02, 0.04)),
+        ("spacecraft", "inertia", [["30 kg m^2", 0, 0], [0, 3e1, 0], [0, 0, "5e4 g m^2"]], np.diag([30, 30, 50])),
     ],
 )
 def test_a_number_can_be_text_with_a_unit(table, key, said, value):

@@ -319,6 +319,14 @@ def test_packaged_scenarios_are_valid(path):
     VALIDATOR.validate(tomllib.loads(path.read_text()))
 
 
+def test_numbers_of_lists_and_matrices_can_be_texts_with_a_unit():
+    for inertia in (["300 kg cm^2", 0.02, 0.04], [["300 kg cm^2", 0, 0], [0, 0.02, 0], [0, 0, 0.04]]):
+        VALIDATOR.validate({"spacecraft": {"inertia": inertia}})
+    VALIDATOR.validate({"flexible": {"coupling": [["0.8 sqrt(kg) m", 0, 0]]}})
+    for table, key, value in (("spacecraft", "inertia", "300 kg cm^2"), ("flexible", "coupling", ["0.8 sqrt(kg) m"])):
+        assert not VALIDATOR.is_valid({table: {key: value}})
+
+
 def test_the_schema_has_every_key_and_no_other():
     for _, tables in BUILT_IN:
         VALIDATOR.validate(tables)
