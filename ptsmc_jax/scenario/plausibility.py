@@ -5,6 +5,8 @@ others concern values in wrong units, an inertia that the torque limits contradi
 period, and a ground target below the horizon.
 """
 
+import itertools
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -20,7 +22,10 @@ MAX_BOUND_RATIO = 10.0
 MAX_DELAY_FRACTION = 0.1  # delay as a fraction of t_f; a longer one was probably given in seconds
 MAX_TORQUE_RATIO = 100.0  # torque of the slew relative to the limit; an inertia in kg cm^2 is wrong by 1e4
 MAX_TURN = 1.0  # largest turn in one control period [rad]; for real spacecraft it is a few mrad
-MAX_ATTITUDE_NOISE = np.deg2rad(5.0)  # noise [rad]; a larger one was probably given in another unit
+# Noise of the attitude [rad]; a larger one was probably given in another unit. For a gyro it is the noise of the angle
+# that is integrated until t_f: 0.5 deg/sqrt(h) reaches it after 100 h. It is not compared with the angle of the turn,
+# since a run may begin at the reference.
+MAX_ATTITUDE_NOISE = np.deg2rad(5.0)
 
 
 def warnings(scenario: Scenario) -> list[str]:
@@ -110,7 +115,7 @@ def _unstable_surface_rate(scenario: Scenario) -> Iterator[str]:
 
 
 def _implausible_noise(scenario: Scenario) -> Iterator[str]:
-    """Warn about a noisy star tracker whose gyro has no errors, or whose noise is larger than that of a real device."""
+    """Warn about a noisy star tracker whose gyro has no errors, or a noise that is larger than that of real devices."""
     device: Any = scenario.hardware
     noise = getattr(device, "attitude_noise", None) or 0.0
     gyro_keys = ("rate_noise", "rate_noise_density", "rate_bias", "rate_bias_walk")
@@ -119,14 +124,23 @@ def _implausible_noise(scenario: Scenario) -> Iterator[str]:
             f"hardware.attitude_noise is {noise:g} rad, but the gyro has no error: the law measures the true rate; "
             "set hardware.rate_noise or rate_noise_density, or rate_noise = 0 to confirm a perfect gyro"
         )
-    noises = {"hardware.attitude_noise": noise}
-    for k, sensor in enumerate(getattr(scenario.sensors, "each", ())):
-        noises[f"sensors[{k}].noise_across"] = getattr(sensor, "noise_across", None) or 0.0
-    for key, noise in noises.items():
-        if noise >= MAX_ATTITUDE_NOISE:
+    devices = {f"sensors[{k}]": sensor for k, sensor in enumerate(getattr(scenario.sensors, "each", ()))}
+    devices["hardware"] = device
+    t_f = scenario.controller.t_f
+    at_t_f = f" when it is integrated until t_f = {t_f:g} s"
+    keys = {  # factor from the noise to an angle, its unit, the unit of the number if it is wrong, and when it holds
+        "attitude_noise": (1.0, "rad", "arcsec", ""),
+        "noise_across": (1.0, "rad", "arcsec", ""),
+        "rate_noise": (math.sqrt(scenario.loop.period * t_f), "rad/s", "deg/s", at_t_f),
+        "rate_noise_density": (math.sqrt(t_f), "rad/s/sqrt(Hz)", "deg/sqrt(h)", at_t_f),
+    }
+    for (place, device), (key, (factor, unit, other_unit, when)) in itertools.product(devices.items(), keys.items()):
+        noise = getattr(device, key, None) or 0.0
+        angle = factor * noise
+        if angle >= MAX_ATTITUDE_NOISE:
             yield (
-                f"{key} is {noise:g} rad, {np.rad2deg(noise):.3g} deg, which is very large; a number in another unit "
-                f'has the unit in its value: "{noise:g} arcsec"'
+                f"{place}.{key} is {noise:g} {unit}, {np.rad2deg(angle):.3g} deg{when}, "
+                f'which is very large; a number in another unit has the unit in its value: "{noise:g} {other_unit}"'
             )
 
 

@@ -463,6 +463,29 @@ def test_an_implausible_star_tracker_noise_causes_a_warning(noise, said):
         assert not said or (found[0].startswith(key) and f'"{noise:g} arcsec"' in found[0])
 
 
+@pytest.mark.parametrize(
+    ("key", "noise", "said"),
+    [
+        ("rate_noise_density", 0.1, True),  # 0.1 deg/sqrt(h) without its unit
+        ("rate_noise_density", 0.016, True),  # 5.02 deg
+        ("rate_noise_density", 0.0158, False),  # 4.96 deg
+        ("rate_noise_density", "0.5 deg/sqrt(h)", False),  # a poor gyro
+        ("rate_noise", 0.1, True),  # 0.1 deg/s without its unit
+        ("rate_noise", 0.072, True),  # 5.05 deg
+        ("rate_noise", 0.071, False),  # 4.98 deg
+        ("rate_noise", "0.1 deg/s", False),
+    ],
+)
+def test_a_gyro_noise_that_integrates_to_a_large_angle_causes_a_warning(key, noise, said):
+    """The angle is density * sqrt(t_f) = noise * sqrt(period * t_f), here with t_f = 30 s and a period of 0.05 s."""
+    tracker, gyro = {"kind": "star_tracker", "noise_across": 1e-5}, {"kind": "gyro", key: noise}
+    devices = {"hardware": {"hardware": {key: noise}}, "sensors[1]": {"sensors": [tracker, gyro]}}
+    for place, tables in devices.items():
+        read = scenario.from_tables({"loop": {"mode": "sampled"}, **tables})
+        found = [one for one in plausibility.warnings(read) if "another unit" in one]
+        assert [one.startswith(f"{place}.{key} is {noise} rad/s") for one in found] == [True] * said
+
+
 SURFACE = {"t_f": 60.0, "surface_rate": 1.0}
 
 
