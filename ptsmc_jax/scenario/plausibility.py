@@ -19,7 +19,8 @@ from ptsmc_jax.theory import stability_limits
 
 # largest ratio of a stated bound to the bound of the disturbance, or its inverse, without a warning
 MAX_BOUND_RATIO = 10.0
-MAX_DELAY_FRACTION = 0.1  # delay as a fraction of t_f; a longer one was probably given in seconds
+# Delay or lag as a fraction of t_f. With a lag of 0.1 t_f, a turn with the default gains does not converge at t_f.
+MAX_DELAY_FRACTION = 0.1
 MAX_TORQUE_RATIO = 100.0  # torque of the slew relative to the limit; an inertia in kg cm^2 is wrong by 1e4
 MAX_TURN = 1.0  # largest turn in one control period [rad]; for real spacecraft it is a few mrad
 # Noise of the attitude [rad]; a larger one was probably given in another unit. For a gyro it is the noise of the angle
@@ -41,6 +42,7 @@ def warnings(scenario: Scenario) -> list[str]:
         _implausible_inertia,
         _implausible_noise,
         _delay_in_seconds,
+        _lag_in_milliseconds,
         _unstable_surface_rate,
         _target_below_horizon,
     )
@@ -92,6 +94,16 @@ def _delay_in_seconds(scenario: Scenario) -> Iterator[str]:
         yield (
             f"hardware.delay is {delay}, a delay of {delay * period:g} s with loop.period = {period:g} s; the key "
             "counts control periods, not seconds"
+        )
+
+
+def _lag_in_milliseconds(scenario: Scenario) -> Iterator[str]:
+    """Warn about a lag that is not short compared with t_f. It was probably given in milliseconds."""
+    lag, t_f = scenario.devices.torque_lag or 0.0, scenario.controller.t_f
+    if lag >= MAX_DELAY_FRACTION * t_f:
+        yield (
+            f"hardware.torque_lag is {lag:g} s, which is too long for controller.t_f = {t_f:g} s; a number in another "
+            f'unit has the unit in its value: "{lag:g} ms"'
         )
 
 

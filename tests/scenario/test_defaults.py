@@ -451,6 +451,17 @@ def test_a_delay_that_is_probably_in_seconds_causes_a_warning(delay, said):
     assert found == [f"{known}; the key counts control periods, not seconds"] * said
 
 
+@pytest.mark.parametrize("plant", ["spacecraft", "chain"])
+@pytest.mark.parametrize(
+    ("lag", "said"), [(50.0, True), (3.0, True), (2.9, False), ("50 ms", False), (50, True), (None, False)]
+)
+def test_a_lag_that_is_long_compared_with_t_f_causes_a_warning(plant, lag, said):
+    """The warning begins at a tenth of t_f = 30 s."""
+    tables = {"plant": {"kind": plant}, "controller": {"t_f": 30.0}, "loop": {"mode": "sampled"}}
+    found = plausibility.warnings(scenario.from_tables({**tables, "hardware": {"torque_lag": lag}}))
+    assert [f"hardware.torque_lag is {lag:g} s" in one and f'"{lag:g} ms"' in one for one in found] == [True] * said
+
+
 @pytest.mark.parametrize(("noise", "said"), [(10.0, True), (0.1, True), (1e-2, False), ("10 arcsec", False)])
 def test_an_implausible_star_tracker_noise_causes_a_warning(noise, said):
     tracker, gyro = {"kind": "star_tracker", "noise_across": noise}, {"kind": "gyro", "rate_noise": 1e-6}
