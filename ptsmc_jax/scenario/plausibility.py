@@ -13,7 +13,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from ptsmc_jax.scenario import disturbance_tables, errors
+from ptsmc_jax import formulas
+from ptsmc_jax.scenario import disturbance_tables, errors, tables
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.theory import stability_limits
 
@@ -45,8 +46,35 @@ def warnings(scenario: Scenario) -> list[str]:
         _lag_in_milliseconds,
         _unstable_surface_rate,
         _target_below_horizon,
+        _limit_beyond_actuators,
     )
     return [*bound_warnings, *(warning for check in checks for warning in check(scenario))]
+
+
+def _torque_limits(scenario: Scenario) -> Iterator[tuple[str, float, np.ndarray]]:
+    """Return key and value of each torque limit, and the axes (inputs, channels) of the torques that it limits."""
+    limit, wheels = scenario.devices.torque_limit, scenario.reaction_wheels
+    if limit is not None:
+        yield "hardware.torque_limit", limit, np.eye(scenario.inputs)
+    if wheels is not None and wheels.torque_limit is not None:
+        yield "wheels.torque_limit", wheels.torque_limit, formulas.wheel_axes(wheels.spin_axes()).T
+
+
+def _limit_beyond_actuators(scenario: Scenario) -> Iterator[str]:
+    """Warn about a required torque that is larger than the torque limits of the actuators."""
+    unit = " N m" if scenario.motion == "spacecraft" else ""
+    for key, limit, axes in _torque_limits(scenario):
+        about_axis = limit * float(np.max(np.sum(np.abs(axes), axis=1)))
+        largest = {"peak_torque": about_axis, "peak_torque_delivered": about_axis}
+        if key == "wheels.torque_limit":
+            largest["peak_wheel_torque"] = limit
+        for metric, torque in largest.items():
+            required = tables.limit_of(scenario, metric)
+            if required is not None and required > torque * (1.0 + 1e-9):
+                yield (
+                    f"requirements.{metric} is {required:g}{unit}, but with {key} = {limit:g}{unit} the actuators "
+                    f"deliver at most {torque:.3g}{unit}: the requirement does not prevent saturation"
+                )
 
 
 def _target_below_horizon(scenario: Scenario) -> Iterator[str]:

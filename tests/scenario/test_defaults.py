@@ -451,6 +451,34 @@ def test_a_delay_that_is_probably_in_seconds_causes_a_warning(delay, said):
     assert found == [f"{known}; the key counts control periods, not seconds"] * said
 
 
+PYRAMID = 4.0 / math.sqrt(3.0)  # largest torque about an axis, relative to that of a wheel
+
+
+@pytest.mark.parametrize(
+    ("metric", "key", "ratio"),
+    [
+        ("peak_torque", "hardware", 1.0),
+        ("peak_torque_delivered", "hardware", 1.0),
+        ("peak_torque", "wheels", PYRAMID),
+        ("peak_wheel_torque", "wheels", 1.0),
+    ],
+)
+@pytest.mark.parametrize(("factor", "said"), [(1.0, False), (1.001, True), (1000.0, True)])
+def test_a_required_torque_beyond_the_actuators_causes_a_warning(metric, key, ratio, factor, said):
+    tables = {key: {"torque_limit": 0.5}, "requirements": {metric: 0.5 * ratio * factor}, "loop": {"mode": "sampled"}}
+    found = [one for one in plausibility.warnings(scenario.from_tables(tables)) if "saturation" in one]
+    assert [f"requirements.{metric} is" in one and f"{key}.torque_limit = 0.5 N m" in one for one in found] == [
+        1
+    ] * said
+
+
+@pytest.mark.parametrize(("limit", "said"), [(2.0, False), (3.0, True)])
+def test_a_required_input_of_another_plant_beyond_its_limit_causes_a_warning(limit, said):
+    tables = {"plant": {"kind": "chain"}, "hardware": {"torque_limit": 2.0}, "requirements": {"peak_torque": limit}}
+    found = plausibility.warnings(scenario.from_tables(tables))
+    assert [one.startswith("requirements.peak_torque is 3, but") for one in found] == [True] * said
+
+
 @pytest.mark.parametrize("plant", ["spacecraft", "chain"])
 @pytest.mark.parametrize(
     ("lag", "said"), [(50.0, True), (3.0, True), (2.9, False), ("50 ms", False), (50, True), (None, False)]
