@@ -1,8 +1,8 @@
 """Warn about valid scenarios whose values are probably mistakes. Start with `warnings`.
 
-Three warnings concern noise: disturbance bounds far from the disturbance, noisy estimates, a missing gyro error. The
-others concern values in wrong units, an inertia that the torque limits contradict, a sliding surface too fast for the
-period, and a ground target below the horizon.
+Three warnings concern noise: disturbance bounds far from the disturbance, noisy estimates, a missing gyro error. Three
+concern the torque limits: they contradict an inertia, a requirement or a disturbance. The others concern values in
+wrong units, a sliding surface too fast for the period, and a ground target below the horizon.
 """
 
 import itertools
@@ -47,6 +47,7 @@ def warnings(scenario: Scenario) -> list[str]:
         _unstable_surface_rate,
         _target_below_horizon,
         _limit_beyond_actuators,
+        _disturbance_beyond_actuators,
     )
     return [*bound_warnings, *(warning for check in checks for warning in check(scenario))]
 
@@ -75,6 +76,26 @@ def _limit_beyond_actuators(scenario: Scenario) -> Iterator[str]:
                     f"requirements.{metric} is {required:g}{unit}, but with {key} = {limit:g}{unit} the actuators "
                     f"deliver at most {torque:.3g}{unit}: the requirement does not prevent saturation"
                 )
+
+
+def _disturbance_beyond_actuators(scenario: Scenario) -> Iterator[str]:
+    """Warn if the constant part of the disturbance of a spacecraft is larger than the torque limits of the actuators.
+
+    Periodic parts are not examined: their torques may be larger, at frequencies that no actuator follows.
+    """
+    if scenario.motion != "spacecraft":
+        return
+    keys, terms = {"constant": "amplitude", "sinusoid": "bias"}, scenario.terms_by_place.values()
+    parts = [getattr(term, keys[term.kind]) for term in terms if term.kind in keys]
+    constant = np.sum(parts, axis=0) if parts else np.zeros(3)
+    for key, limit, axes in _torque_limits(scenario):
+        needed = float(np.max(np.abs(np.linalg.pinv(axes) @ constant)))
+        if needed > limit:
+            each = "of a wheel" if key == "wheels.torque_limit" else "about an axis"
+            yield (
+                f"disturbance has the constant part {errors.brief(constant.tolist())} N m, but {key} is {limit:g} N m: "
+                f"the actuators cannot hold the attitude, which needs {needed:.3g} N m {each}"
+            )
 
 
 def _target_below_horizon(scenario: Scenario) -> Iterator[str]:
