@@ -27,7 +27,7 @@ from tests.helpers import (
     undocumented,
 )
 from tests.output.pages import checked
-from tuning.output import formats
+from tuning.output import formats, terminal
 from tuning.studies import compare, judging, single, stability
 
 
@@ -130,6 +130,10 @@ def test_tune_command_writes_results_and_repeats_them(command, tmp_path, monkeyp
     other, _, err = command("tune", "s.toml", "--out", "t", "--seed", 1)
     assert other == 2
     assert "--force" in err
+    with monkeypatch.context() as patch:
+        patch.setattr(terminal, "print_lines", lambda *_: "é".encode("ascii"))
+        with pytest.raises(UnicodeEncodeError):  # no fault of the summary
+            command("tune", "s.toml", "--out", "t")
     for damaged in ({"status": "met"}, {**summary, "status": "?"}, {**summary, "held_out": 1}):
         (tmp_path / "t" / "summary.json").write_text(json.dumps(damaged))
         assert "t/summary.json is damaged or of another version" in refused(

@@ -227,7 +227,7 @@ def test_what_is_no_result_is_refused(command, simulated, tmp_path):
         ("summary.json", None, "run/summary.json does not exist: "),
         ("summary.json", "{", "run/summary.json is damaged or of another version: "),
         ("summary.json", "[]", "run/summary.json is damaged or of another version: Expected `object`, got `array`; "),
-        ("summary.json", "{}", "run/summary.json is damaged or of another version: 'verdicts' is missing; "),
+        ("summary.json", "{}", "run/summary.json is damaged or of another version: 'verdicts' is missing "),
         ("summary.json", '{"verdicts": 1}', "run/summary.json is damaged or of another version: "),
         ("summary.json", '{"verdicts": {}}', "run/summary.json is damaged or of another version: "),
         (
@@ -238,10 +238,14 @@ def test_what_is_no_result_is_refused(command, simulated, tmp_path):
         ("versions.json", '{"command": ["x"]}', "run holds no result"),
         ("scenario.toml", None, "the scenario file run/scenario.toml does not exist"),
         ("scenario.toml", "a = [", "the scenario file run/scenario.toml is no valid TOML: "),
-        ("scenario.toml", "", "run/scenario.toml is damaged or of another version: 'controller' is missing; "),
+        ("scenario.toml", "", "run/scenario.toml is damaged or of another version: 'controller' is missing "),
+        ("scenario.toml", "plant = 1", "run/scenario.toml is damaged or of another version: "),
+        ("scenario.toml", "plant.kind = 'x'", "run/scenario.toml is damaged or of another version: plant.kind is "),
+        ("scenario.toml", "controller.t_f = 'x'", "run/scenario.toml is damaged or of another version: "),
+        ("scenario.toml", "controller = { t_f = 1, delta = 'x' }", "run/scenario.toml is damaged or of "),
         ("trajectory.csv", None, "run/trajectory.csv does not exist: "),
         ("trajectory.csv", "", "run/trajectory.csv is damaged or of another version: it has no rows; "),
-        ("trajectory.csv", "a,b\n0,1\n", "run/trajectory.csv is damaged or of another version: 't' is missing; "),
+        ("trajectory.csv", "a,b\n0,1\n", "run/trajectory.csv is damaged or of another version: 't' is missing "),
         ("trajectory.csv", "t,x1\n0.0,1.0\n0.1", "run/trajectory.csv is damaged or of another version: line 3 must "),
         ("trajectory.csv", "t,x1\n0.0,1.0\n0.1,1.0e-", "run/trajectory.csv is damaged or of another version: "),
     ):
@@ -252,6 +256,17 @@ def test_what_is_no_result_is_refused(command, simulated, tmp_path):
         assert refused(command, tmp_path, "report", "run").startswith(f"ptsmc: {said}"), name
         for path, old in kept.items():
             (simulated / path).write_bytes(old)
+
+
+@pytest.mark.parametrize(("module", "name"), [(page_charts, "history"), (page.json, "dumps")])
+def test_an_error_of_the_page_itself_is_not_blamed_on_a_file(simulated, monkeypatch, module, name):
+    monkeypatch.setattr(module, name, raise_type_error)
+    with pytest.raises(TypeError, match="of the code"):
+        page.build(simulated)
+
+
+def raise_type_error(*_, **__):
+    raise TypeError("an error of the code")
 
 
 def test_without_plotly_it_says_how_to_install_it(command, simulated, monkeypatch):

@@ -81,6 +81,7 @@ def run(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, qu
     # only an earlier summary may be damaged
     with reports.name_in_errors(folder / store.SUMMARY) if was_finished else contextlib.nullcontext():
         status = STATUS[summary["status"]]
-        if not quiet:
-            terminal.print_result(search.identity["command"], summary, loaded.plant.kind, folder, earlier=was_finished)
+        result = reports.build(search.identity["command"], summary, loaded.plant.kind)
+    if not quiet:
+        terminal.print_report(result, folder, earlier=was_finished)
     return status

@@ -23,6 +23,7 @@ from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.figures.style import objective_display
 from ptsmc_jax.scenario import parsing
 from ptsmc_jax.scenario.tables import Tune, objective_name
+from ptsmc_jax.simulation.catalogues import CATALOGUES
 from tuning.errors import UsageError
 from tuning.output import campaign_report, compare_report, page_charts, reports, summaries
 from tuning.output.report import Block, Chart, Code, Picture, Section, Table
@@ -88,11 +89,7 @@ class Result:
     source: Path  # the file with the summary
     summary: dict[str, Any]
     scenario: dict[str, Any]  # tables of scenario.toml; empty for `ptsmc reproduce`
-
-    @property
-    def plant(self) -> str:
-        """Return the kind of the plant."""
-        return self.scenario.get("plant", {}).get("kind", "spacecraft")
+    plant: str  # kind of the plant
 
 
 def read(folder: Path) -> Result:
@@ -119,7 +116,11 @@ def read(folder: Path) -> Result:
         is_map = command == "map"
         summary = {"rows": _read_rows(source)} if is_map else msgspec.json.decode(source.read_bytes(), type=dict)
     scenario = {} if command == "reproduce" else parsing.read_toml(folder / "scenario.toml")
-    return Result(folder, versions, source, summary, scenario)
+    with reports.name_in_errors(folder / "scenario.toml"):
+        plant = scenario.get("plant", {}).get("kind", "spacecraft")
+        if plant not in CATALOGUES:
+            raise ValueError(f"plant.kind is {plant!r}")
+    return Result(folder, versions, source, summary, scenario, plant)
 
 
 def _read_rows(path: Path) -> list[list[str]]:
@@ -171,73 +172,79 @@ def build(folder: Path) -> str:
     allowed = " ".join(f"'sha256-{checksum}'" for checksum in checksums) or "'none'"
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string((HERE / "page.html").read_text(encoding="utf-8"))
-    with reports.name_in_errors(result.source):
-        return template.render(
-            title=f"ptsmc {result.versions['command']}: {folder.resolve().name}",
-            report=report,
-            sections=sections,
-            policy=f"default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; script-src {allowed}",
-            style=(HERE / "page.css").read_text(encoding="utf-8"),
-            # < is escaped, so that no text in the data can close the HTML element
-            figures=json.dumps(figures, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
-            scripts=scripts,
-        )
+    return template.render(
+        title=f"ptsmc {result.versions['command']}: {folder.resolve().name}",
+        report=report,
+        sections=sections,
+        policy=f"default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; script-src {allowed}",
+        style=(HERE / "page.css").read_text(encoding="utf-8"),
+        # < is escaped, so that no text in the data can close the HTML element
+        figures=json.dumps(figures, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
+        scripts=scripts,
+    )
 
 
 def _history_charts(result: Result) -> list[Block]:
     """Return the charts of a run."""
-    head, *rows = _read_rows(result.folder / "trajectory.csv")
-    values = np.array([[float(cell or "nan") for cell in row] for row in rows])
-    columns = dict(zip(head, values.T, strict=True))
+    spacecraft = result.plant == "spacecraft"
+    with reports.name_in_errors(result.folder / TABLES["simulate"]):
+        head, *rows = _read_rows(result.folder / TABLES["simulate"])
+        values = np.array([[float(cell or "nan") for cell in row] for row in rows])
+        columns = dict(zip(head, values.T, strict=True))
+        t = columns["t"]
+        q = np.stack([columns[f"q{k + 1}"] for k in range(4)], axis=1) if spacecraft else None
     with reports.name_in_errors(result.folder / "scenario.toml"):
         law = result.scenario["controller"]
-        marks = {"t_f": law["t_f"]}
-    if law.get("delta", 0.0) >= 0.05 * columns["t"][-1]:  # otherwise the labels of t_f - delta and t_f overlap
-        marks["t_f - delta"] = law["t_f"] - law["delta"]
-    spacecraft = result.plant == "spacecraft"
+        marks = {"t_f": float(law["t_f"])}
+        delta = float(law.get("delta", 0.0))
+    if delta >= 0.05 * t[-1]:  # otherwise the labels of t_f - delta and t_f overlap
+        marks["t_f - delta"] = marks["t_f"] - delta
     caption = "Drag to zoom, double-click to see all; the dotted lines are the hand-over and t_f."
     charts: list[Block] = [Chart("history", page_charts.history(columns, spacecraft, marks), caption, "tall")]
-    if spacecraft:
-        q = np.stack([columns[f"q{k + 1}"] for k in range(4)], axis=1)
+    if q is not None:
         caption = "The body and its axes over time; dashed: the inertial axes. Drag to turn the view."
-        charts.append(Chart("attitude", page_charts.attitude(columns["t"], q), caption, "square"))
+        charts.append(Chart("attitude", page_charts.attitude(t, q), caption, "square"))
     return charts
 
 
 def _search_chart(result: Result) -> Chart:
     """Return the chart of a search."""
-    head, *rows = _read_rows(result.folder / "history.csv")
-    points = [dict(zip(head, row, strict=True)) for row in rows]
     caption = "The objective along the local search from each starting point; a hollow point breaks a limit."
-    tune = result.scenario.get("tune", {})
-    objective = Tune(**{key: tune[key] for key in ("minimise", "statistic", "level") if key in tune})
-    display = objective_display(objective_name(objective), objective.minimise, result.plant)
-    return Chart("search", page_charts.search(points, head[2], *display), caption)
+    with reports.name_in_errors(result.folder / "scenario.toml"):
+        tune = result.scenario.get("tune", {})
+        objective = Tune(**{key: tune[key] for key in ("minimise", "statistic", "level") if key in tune})
+        display = objective_display(objective_name(objective), objective.minimise, result.plant)
+    with reports.name_in_errors(result.folder / TABLES["tune"]):
+        head, *rows = _read_rows(result.folder / TABLES["tune"])
+        points = [dict(zip(head, row, strict=True)) for row in rows]
+        return Chart("search", page_charts.search(points, head[2], *display), caption)
 
 
 def _front_chart(result: Result) -> Chart:
     """Return the chart of a front of error against torque."""
     caption = "Hover over a point for its gains. Bars are 95 % intervals; the dashed line is the required limit."
-    requirement = result.scenario.get("requirements", {}).get("peak_torque")
+    with reports.name_in_errors(result.folder / "scenario.toml"):
+        requirement = result.scenario.get("requirements", {}).get("peak_torque")
     limit = requirement.get("limit") if isinstance(requirement, dict) else requirement
-    return Chart("front", page_charts.front(front.read(result.summary), limit), caption)
+    with reports.name_in_errors(result.source):
+        return Chart("front", page_charts.front(front.read(result.summary), limit), caption)
 
 
 def _charts(result: Result) -> dict[str, list[Block]]:
     """Return the charts and the table that only the page shows, by the titles of their sections."""
     command = result.versions["command"]
-    files = {"simulate": TABLES["simulate"], "tune": TABLES["tune"], "montecarlo": "scenario.toml"}
-    with reports.name_in_errors(result.folder / files.get(command, store.SUMMARY)):
-        if command == "simulate":
-            return {"History": _history_charts(result)}
-        if command == "tune":
-            return {"Search": [_search_chart(result)]}
-        if command == "montecarlo":
+    if command == "simulate":
+        return {"History": _history_charts(result)}
+    if command == "tune":
+        return {"Search": [_search_chart(result)]}
+    if command == "montecarlo":
+        with reports.name_in_errors(result.folder / "scenario.toml"):
             return {"Gains": [campaign_report.gain_table(result.scenario, result.plant)]}
-        if command == "compare":
+    if command == "compare":
+        with reports.name_in_errors(result.source):
             return compare_report.charts(summaries.read(summaries.Compare, result.summary).laws)
-        if command == "pareto" and result.summary["against"] == "torque":
-            return {front.KINDS["torque"].title: [_front_chart(result)]}
+    if command == "pareto" and result.summary["against"] == "torque":
+        return {front.KINDS["torque"].title: [_front_chart(result)]}
     return {}
 
 

@@ -51,16 +51,17 @@ def build(command: str, summary: Mapping[str, object], plant: str) -> Report:
 
 @contextlib.contextmanager
 def name_in_errors(path: Path) -> Iterator[None]:
-    """Raise RefusedError with the name of a file instead of the errors that its content causes."""
+    """Raise RefusedError with the name of a file instead of the errors that its content causes.
+
+    The block must only read the content of this file: any other error in it would get the name of the file too.
+    """
     try:
         yield
-    except RefusedError:
-        raise
     except (csv.Error, AttributeError, LookupError, TypeError, ValueError, RecursionError) as error:
-        problem = f"{error} is missing" if isinstance(error, KeyError) else error
+        problem = f"{error} is missing or not known" if isinstance(error, KeyError) else error
         raise RefusedError(
             f"{path} is damaged or of another version: {problem}; repeat its command with --force"
-        ) from None
+        ) from error
 
 
 def run_report(summary: summaries.Run, plant: str) -> Report:

@@ -5,15 +5,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from tuning.output.report import Table
+from tuning.output.report import Report, Table
 
 WIDE = 1000  # assumed number of columns of a file or a pipe
 UNBROKEN_WIDTH = 24  # largest number of columns of a cell that is never broken
 
 
-def print_result(
-    command: str, summary: Mapping[str, object], plant: str, folder: Path, *, earlier: bool = False
-) -> None:
+def print_result(command: str, summary: Mapping[str, object], plant: str, folder: Path) -> None:
     """Print the report of a result without its charts and pictures.
 
     Args:
@@ -21,11 +19,20 @@ def print_result(
         summary: the content of `summary.json`.
         plant: kind of the plant.
         folder: folder of the result.
-        earlier: whether an earlier run wrote the result.
     """
     from tuning.output import reports
 
-    report = reports.build(command, summary, plant)
+    print_report(reports.build(command, summary, plant), folder)
+
+
+def print_report(report: Report, folder: Path, *, earlier: bool = False) -> None:
+    """Print a report without its charts and pictures.
+
+    Args:
+        report: the report.
+        folder: folder of the result.
+        earlier: whether an earlier run wrote the result.
+    """
     print_lines(report.headline, *report.lines)
     for title, content in report.printed():
         if title:
