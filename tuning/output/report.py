@@ -142,7 +142,7 @@ def per_cent_of_limit(entry: "Entry") -> str:
 
 
 def bound_lines(value: float | None, lower_bound: float | None, plant: str) -> Iterator[str]:
-    """Return the ratio of an error to its lower bound; nothing without a bound."""
+    """Return the ratio of the RMS error of a campaign to its lower bound; nothing without a bound."""
     ratio = ratio_to_bound(value, lower_bound)
     if ratio is not None:
         yield f"{format_ratio(ratio)} times the lower bound of {format_error(lower_bound, plant)} with these sensors"

@@ -70,7 +70,10 @@ def run_report(summary: summaries.Run, plant: str) -> Report:
     if status == "ok" and summary.verdicts:
         status = "met" if all(one.met for one in summary.verdicts) else "not met"
     headline, mood = report.headline(status, summary.verdicts, format_named_error(error, plant))
-    lines = [*report.bound_lines(error, summary.lower_bound, plant)]
+    lines = list[str]()
+    if error is not None and summary.lower_bound:
+        bound = format_error(summary.lower_bound, plant)
+        lines.append(f"lower bound of the RMS error of many trials: {bound}; the error of one trial may be smaller")
     if summary.reason:
         when = "" if summary.bad_time is None else f", at {summary.bad_time:.4g} s"
         lines.append(f"status {summary.status}: {summary.reason}{when}")
