@@ -219,7 +219,7 @@ def tradeoff(
     if lower_bound:
         least = float(convert(lower_bound))
         axes.axvline(least, **LOWER_BOUND, label=f"lower bound {least:.3g} {error_unit}")
-    axes.set_xlabel(f"{name} in the window [{error_unit}]")
+    axes.set_xlabel(f"RMS {name} in the window [{error_unit}]")
     for line in (axes.xaxis, axes.yaxis):
         plain_ticks(line)
     legend_below(figure, columns=1)

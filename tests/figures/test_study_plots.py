@@ -57,6 +57,7 @@ def test_a_tradeoff_figure_has_each_trial_and_their_rms():
         "lower bound 0.413 arcsec",
     ]
     assert axes.get_ylabel() == "peak wheel torque [N m]"
+    assert axes.get_xlabel() == "RMS pointing error in the window [arcsec]"
 
 
 def test_the_first_set_of_a_tradeoff_figure_is_not_hidden_by_a_later_one_at_the_same_place():

@@ -68,7 +68,7 @@ def gain_table(summary: Tune) -> Table:
             "ratio to the lower bound",
             lambda group: format_ratio(ratio_to_bound(group.number("window_error", "rms"), group.lower_bound)),
         )
-    add_row(f"largest {quantity}", lambda group: format_error(group.number("window_error", "max"), plant))
+    add_row("largest RMS error of a trial", lambda group: format_error(group.number("window_error", "max"), plant))
     for label, metric, statistic in (
         ("mean peak torque", "peak_torque", "mean"),
         ("largest peak torque", "peak_torque", "max"),
