@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -100,7 +101,9 @@ def test_tune_command_writes_results_and_repeats_them(command, tmp_path, monkeyp
     assert rms == pytest.approx(summary["held_out"]["window_error"]["rms"], rel=1e-12)
     assert (tuned.loop.clock, tuned.controller.sign_width) == ("flight", 1e-3)
     header, *rows = (tmp_path / "t" / "history.csv").read_text().splitlines()
-    assert header == "step,start,rms_window_error,eta,delta,peak_torque_over_limit"
+    assert header == "step,start,stage,rms_window_error,eta,delta,peak_torque_over_limit"
+    stages = Counter(tuple(row.split(",")[1:3]) for row in rows)  # points of a start have several stages
+    assert max(stages.values()) <= scenario.read(tmp_path / "s.toml").search.steps < len(rows)
     assert len(rows) == summary["search"]["history_points"] >= 2
     # The tuned gains are more accurate than the scenario's gains on the same trials. They need not be more accurate
     # than the published gains, whose faster surface and observer are not free in this search.

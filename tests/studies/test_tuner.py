@@ -155,7 +155,7 @@ def test_every_column_of_a_history_has_its_own_name(tune, column, name):
     tables = tomllib.loads(SHORT_CHAIN) | {"tune": {"free": ["eta", "t_f"], **tune}}
     some = scenario.from_tables(tables)
     columns = tune_files.history_columns(some, ["peak_torque"])
-    assert columns == ["step", "start", column, "eta", "t_f", "peak_torque_over_limit"]
+    assert columns == ["step", "start", "stage", column, "eta", "t_f", "peak_torque_over_limit"]
     assert objective_name(some.search) == name
 
 
@@ -197,7 +197,7 @@ class Rising:
         self.evaluate.rollouts += 10
         upper = np.array(self.evaluate.bounds.upper)
         value = float(1.0 / upper[self.evaluate.bounds.names.index("k1")])
-        return Found(upper, value, history=(Step(0, upper, value, upper),))
+        return Found(upper, value, history=(Step(0, upper, value, upper, 1),))
 
 
 def test_search_widens_default_bounds_of_gains_that_matter(monkeypatch):

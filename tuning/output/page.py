@@ -217,7 +217,7 @@ def _search_chart(result: Result) -> Chart:
     with reports.name_in_errors(result.folder / TABLES["tune"]):
         head, *rows = _read_rows(result.folder / TABLES["tune"])
         points = [dict(zip(head, row, strict=True)) for row in rows]
-        return Chart("search", page_charts.search(points, head[2], *display), caption)
+        return Chart("search", page_charts.search(points, head[3], *display), caption)
 
 
 def _front_chart(result: Result) -> Chart:

@@ -219,7 +219,7 @@ def search(
     for row in rows:
         starts.setdefault(row["start"], []).append(row)
     ratio_columns = [name for name in rows[0] if name.endswith("_over_limit")]
-    gains = [name for name in rows[0] if name not in ("step", "start", objective, *ratio_columns)]
+    gains = [name for name in rows[0] if name not in ("step", "start", "stage", objective, *ratio_columns)]
     data = []
     for k, (start, steps) in enumerate(starts.items()):
         values = np.array([float(row[objective] or "nan") for row in steps])

@@ -60,11 +60,13 @@ class Step:
     gains: np.ndarray  # (gains,)
     value: float  # objective over the training trials; NaN if no trial completes
     worst: np.ndarray  # (requirements,) largest metric / limit; infinite if a trial fails
+    stage: int  # number of the stage of the search: each stage searches again from some starting points
 
 
 def _is_equal(one: Step, other: Step) -> bool:
-    pairs = zip(vars(one).values(), vars(other).values(), strict=True)
-    return all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
+    """Return whether two steps are equal apart from their stage."""
+    names = ("start", "gains", "value", "worst")
+    return all(np.array_equal(getattr(one, name), getattr(other, name), equal_nan=True) for name in names)
 
 
 def _few_trials(problem: Problem) -> Problem:
@@ -102,6 +104,7 @@ class LocalSearches:
         self._history: dict[int, list[Step]] = {}  # accepted points by number of the local search
         self._ends: dict[int, Best] = {}  # best point of each local search
         self._best_start = 0  # number of the local search that found the best point
+        self._stage = 0  # number of the stage, see `Step`
 
     @property
     def started(self) -> bool:
@@ -255,6 +258,7 @@ class LocalSearches:
     ) -> None:
         """Run local searches, `SEARCHES_PER_DEVICE` at a time for each device; contenders: their starting points."""
         tightened, bests, reports = self.tightened(problem), dict[int, Best](), 0
+        self._stage += 1
 
         def search(k: int, ask: Ask) -> None:
             start = contenders[k]
@@ -349,6 +353,7 @@ class LocalSearches:
             normalised: (gains,) normalised gains of the point.
             size: points of a generation and spread of the first generation, see `evolution.evolve`.
         """
+        self._stage += 1
         tightened = self.tightened(problem)
         best, _ = self._best_of(tightened, normalised[None])
         try:
@@ -490,6 +495,7 @@ class LocalSearches:
             tolerance: change of F at which the search ends.
             replace_best: replace the best point so far, because the problem has changed.
         """
+        self._stage += 1
         best, tightened = self._new_best(problem, start.normalised), self.tightened(problem)
         measure, record = partial(self._evaluate.measure_with_gradients, tightened), partial(self._record, number)
         try:
@@ -507,7 +513,7 @@ class LocalSearches:
     def _record(self, start: int, measured: Measurement) -> None:
         """Append a measured point to the history of the local search with this number, unless it is there already."""
         worst = np.where(count_failures(measured.c)[0] > 0, np.inf, largest_ratios(measured.c, self._margin)[0])
-        step = Step(start, measured.gains[0], float(measured.objective[0]), worst)
+        step = Step(start, measured.gains[0], float(measured.objective[0]), worst, self._stage)
         steps = self._history.setdefault(start, [])
         if not any(_is_equal(step, earlier) for earlier in steps):
             steps.append(step)

@@ -198,7 +198,7 @@ def write(folder: Path, scenario: Scenario, tuning: Tuning, figures: bool, ident
     store.write_run_files(folder, parsing.dump(scenario), identity, summary(tuning))
     store.write_toml(folder / "tuned.toml", custom_parts.copy_custom_files(parsing.dump(tuning.tuned), folder))
     rows = [
-        [step, point.start, point.value, *point.gains, *point.worst]
+        [step, point.start, point.stage, point.value, *point.gains, *point.worst]
         for path in _points_by_start(tuning.search.history)
         for step, point in enumerate(path)
     ]
@@ -216,6 +216,7 @@ def history_columns(scenario: Scenario, limited: Iterable[str]) -> list[str]:
     return [
         "step",
         "start",
+        "stage",
         objective,
         *gain_names.free_gain_names(scenario),
         *(f"{metric}_over_limit" for metric in limited),
