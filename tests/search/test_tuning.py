@@ -379,6 +379,8 @@ def test_search_agrees_with_a_brute_force_scan(monkeypatch):
     assert {step.start for step in found.history} == set(range(3))
     assert sum(told[0] == "searching" for told in seen) == 2 * 3  # three starting points in two stages
     assert not any(np.isinf(told[3:]).any() for told in seen)  # NaN before the first point
+    alone = [told for told in seen if told[0].endswith(" local search")]  # one search, so there is nothing to count
+    assert {told[:3] for told in alone} == {("first local search", 0, 0), ("last local search", 0, 0)}
     # 64 Sobol points, two screenings of 16 trials, and at least one attempt with other hand-overs
     swept = (evaluate.rollouts - 2 * 16) / found.problem.trials.size
     assert 64 < swept <= 64 + local_searches.HAND_OVER_ATTEMPTS * hand_overs.OTHER_HAND_OVERS

@@ -158,7 +158,7 @@ class LocalSearches:
         """
         small, normalise = _few_trials(problem), self._evaluate.bounds.normalise
         self._scenario_gains, self._designs = scenario_gains, np.asarray([normalise(one) for one in designs])
-        self._report("first local search", 0, 2, *self.progress)
+        self._report("first local search", 0, 0, *self.progress)
         points = np.concatenate([normalise(scenario_gains)[None], self._designs.reshape(-1, scenario_gains.size)])
         first = points[0]
         if len(points) > 1:
@@ -180,7 +180,7 @@ class LocalSearches:
             Normalised gains, (gains,), of at most `FOLLOWED_STARTS` results, by number of the local search.
         """
         problem, steps = _few_trials(problem), max(2, self._steps // 2)
-        self._report("first local search", 1, 2, *self.progress)
+        self._report("first local search", 0, 0, *self.progress)
         self._search(problem, 0, Start(self.normalised, CAREFUL), steps, replace_best=True)
         first = starting_points(
             self._evaluate, self.tightened(problem), self.normalised, self._designs, starts, seed, self._report
@@ -396,7 +396,7 @@ class LocalSearches:
 
     def _finish(self, problem: Problem) -> None:
         """Improve the best point: other hand-over times, a last local search, and gains reset to the scenario's."""
-        self._report("last local search", 0, 1, *self.progress)
+        self._report("last local search", 0, 0, *self.progress)
         for _ in range(HAND_OVER_ATTEMPTS):
             if not self._try_other_hand_overs(problem):
                 break
