@@ -32,6 +32,7 @@ from tuning.output import (
     tune_report,
 )
 from tuning.output.report import Report, Table
+from tuning.search import confirm, optimise
 from tuning.studies.front import Front, Point, read
 
 EXPECTED = Path(__file__).with_name("reports.txt")
@@ -114,6 +115,16 @@ def skipped(reached: float, **changes: Any) -> Iterable[str]:
 
 def accuracy(times: float | None, **changes: Any) -> Iterable[str]:
     return tune_report.accuracy_lines(examples.tune(accuracy_gain_over_published=times, **changes))
+
+
+def searched(**search: Any) -> Iterable[str]:
+    return tune_report.search_lines(examples.tune(search))
+
+
+CONFIRMED = {"metric": "effort", "confirmed": True, "trials": 8192, "violations": 20, "allowed": 29,
+             "probability": 0.999}  # fmt: skip
+WORST_CASE = {"metric": "peak_torque", "ratio": 1.03, "unbounded": False, "breaks_limit": True, "status": "ok",
+              "moved": ["initial_attitude"]}  # fmt: skip
 
 
 def shortest(theory: float | None, simulated: float | None, quantile: float | None = None) -> Any:
@@ -203,6 +214,15 @@ TUNINGS: dict[str, Callable[[], Any]] = {
     "shortest time without simulation": lambda: shortest(20.1234, None),
     "no confirmation, out of reach": lambda: skipped(1.2),
     "a confirmation": lambda: skipped(1.05),
+    "confirmations on other trials": lambda: searched(confirmed=[
+        CONFIRMED, {**CONFIRMED, "confirmed": False, "violations": 40, "allowed": None, "probability": 0.5}
+    ]),
+    "a worst case with the inertia of a random trial": lambda: searched(
+        hardest={**WORST_CASE, "coordinates": {"initial_attitude": [1.0], "inertia": [0.5]}}
+    ),
+    "a worst case of every dispersion": lambda: searched(
+        hardest={**WORST_CASE, "coordinates": {"initial_attitude": [1.0]}}
+    ),
     "no confirmation needed": lambda: skipped(1.2, quantile=None),
     "saturated actuators": lambda: accuracy(None, held_out=examples.group(
         saturated={"mean": 0.0059, "rms": 0.01, "max": 0.0633})),
@@ -556,6 +576,10 @@ def test_driver_explains_a_significant_part_of_the_variance(correlation, trials,
     (line,) = driver_lines({"initial_angle": {"rank_correlation": correlation, "first_order": 0.0}}, trials)
     driven = "window_error is driven by initial_angle (rank correlation +0.30, 9 % of the variance of the ranks)"
     assert line == (driven if named else NO_DRIVER)
+
+
+def test_constants_of_the_search_have_the_same_values():
+    assert (tune_report.CONFIDENT, tune_report.HOPELESS) == (100 * confirm.CONFIDENT, optimise.HOPELESS)
 
 
 def test_percentages_of_correlated_inputs_overlap():

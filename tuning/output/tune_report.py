@@ -21,6 +21,8 @@ from tuning.output.summaries import Entry, Group, Row, Search, Tune
 
 GRADIENT_TOLERANCE = 0.01  # largest relative difference of gradients from finite differences
 HOPELESS = 1.1  # equal to `optimise.HOPELESS`, whose import takes a second: no confirmation above this metric / limit
+CONFIDENT = 98  # equal to `confirm.CONFIDENT` in per cent, whose import takes a second
+THEORY = "without noise, disturbance, sampling and actuator dynamics"  # assumptions of `solutions.exact_peak`
 PUBLISHED = {  # the published gains in words, by the heading of their column
     "published": "the published gains",
     "published, scaled": "the published gains, scaled to this body and period",
@@ -152,11 +154,12 @@ def search_lines(summary: Tune) -> Iterator[str]:
     yield from _continuation_lines(record)
     yield from _confidence_lines(summary)
     for count in record.confirmed:
-        limit = "none allowed" if count["allowed"] is None else f"at most {count['allowed']} allowed"
+        most = count["allowed"]
+        needed = "which takes more trials" if most is None else f"thus at most {most} trials beyond the limit"
         yield (
             f"{count['metric']} {'confirmed' if count['confirmed'] else 'NOT confirmed'} on {count['trials']} other "
-            f"trials: {count['violations']} beyond the limit, {limit}; probability that the held-out trials meet it: "
-            f"{percent(count['probability'])} %"
+            f"trials, {count['violations']} of them beyond the limit: the held-out trials will meet it with a "
+            f"probability of {percent(count['probability'])} %; a confirmation needs {CONFIDENT} %, {needed}"
         )
     hopeless = [metric for metric, violation in violated.items() if violation is None or violation > HOPELESS]
     if hopeless and not record.confirmed and any(v.quantile is not None for v in summary.verdicts):
@@ -235,7 +238,9 @@ def _describe_worst_case(hardest: Row, *, tuned_for: bool) -> str:
         )
     ratio_text = "has no value" if hardest["ratio"] is None else f"is {hardest['ratio']:.4g} times its limit"
     advice = "" if tuned_for or not hardest["breaks_limit"] else "; tune.worst_case = true tunes for it"
-    return f"{where}, {hardest['metric']} {ratio_text}{advice}"
+    fixed = [name.replace("_", " ") for name in hardest["coordinates"] if name not in hardest["moved"]]
+    without = f"{' and '.join([*fixed, 'noise'])} of a random trial"
+    return f"{where}, but with {without}, {hardest['metric']} {ratio_text}{advice}"
 
 
 def _evolution_comparison(check: Row, record: Search) -> str:
@@ -374,9 +379,9 @@ def _shortest_time_lines(summary: Tune) -> Iterator[str]:
     fraction = "" if shortest["quantile"] is None else f" in {100 * shortest['quantile']:g} % of trials"
     limit = f"peak_torque below {shortest['limit']:g} {shortest['unit'] or ''}".rstrip() + fraction
     if shortest["theory"] is None:
-        yield f"the tuned gains keep {limit} at no t_f, by theory"
+        yield f"the tuned gains keep {limit} at no t_f in theory, {THEORY}"
     else:
         yield (
             f"the tuned gains keep {limit} from t_f = {format_number(shortest['simulated'], '.4g')} s on "
-            f"({shortest['theory']:.4g} s by theory)"
+            f"({shortest['theory']:.4g} s in theory, {THEORY})"
         )
