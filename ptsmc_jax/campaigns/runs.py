@@ -36,6 +36,7 @@ class Run:
     bad_time: float  # time of the first failure [s]; NaN if the status is ok
     verdicts: list[Verdict]
     samples: dict[str, int]  # numbers of samples by the status of exported flight software
+    drawn: dict[str, float]  # initial state and dispersions of the trial by column, in SI units; empty: nominal run
 
     @property
     def met(self) -> bool:
@@ -133,7 +134,9 @@ def simulate(
     row = trial if isinstance(trial, Row) else Row(np.uint32(seed), np.uint32(trial or 0), {})
     key, number = np.uint32(row.seed), np.uint32(row.trial)
     number_or_row = trial if isinstance(trial, Row) else number
-    parts = ready.parts if trial is None else _dispersed_parts(ready.dispersion, ready.parts, key, number_or_row)
+    parts, drawn = ready.parts, {}
+    if trial is not None:
+        parts, drawn = _dispersed_parts(ready.dispersion, ready.parts, key, number_or_row)
     result = jax.tree.map(
         np.asarray, rollout.single_run_program(parts)(parts, key, number, record=True, software=software)
     )
@@ -147,7 +150,8 @@ def simulate(
     if with_margins:
         verdicts += margin_verdicts.judge_loop(parts, ready.margins)
     samples = {name: int(count) for name, count in result.samples.items()}
-    return Run(parts, log, metrics, ready.catalogue, status, reason, float(result.bad_time), verdicts, samples)
+    bad_time, drawn = float(result.bad_time), {name: float(value) for name, value in drawn.items()}
+    return Run(parts, log, metrics, ready.catalogue, status, reason, bad_time, verdicts, samples, drawn)
 
 
 def prepare(ready: Study) -> None:
@@ -157,8 +161,12 @@ def prepare(ready: Study) -> None:
 
 
 @programs.jit
-def _dispersed_parts(dispersion: Dispersion, parts: Parts, seed: jax.Array, trial: jax.Array | Row) -> Parts:
-    return trial_setup(parts, dispersion, seed, trial).dispersed_parts
+def _dispersed_parts(
+    dispersion: Dispersion, parts: Parts, seed: jax.Array, trial: jax.Array | Row
+) -> tuple[Parts, dict[str, jax.Array]]:
+    """Return the parts of a trial, and its initial state and dispersions by column."""
+    values = montecarlo.values(parts, dispersion, seed, trial)
+    return trial_setup(parts, dispersion, seed, trial).dispersed_parts, values
 
 
 def rms_lower_bound(ready: Study, seed: int = 0, rows: Sequence[int | Row] = ()) -> float | None:

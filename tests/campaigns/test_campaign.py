@@ -41,6 +41,9 @@ def test_row_has_all_results_and_inputs_of_its_trial(simulated):
     for name, value in run.metrics.items():
         row = frame[name][250]
         assert row is None if np.isnan(value) else row == pytest.approx(value, rel=1e-12), name
+    dispersed = {name: frame[name][250] for name in ("initial_angle", "initial_x1", "initial_x2")}
+    assert run.drawn == pytest.approx(dispersed, rel=1e-12)
+    assert runs.simulate(made.ready, 3).drawn == {}  # the nominal run
 
 
 BLOCKS = [(128, 4096, 1), (16, 4096, 2), (64, 128, 2), (32, 64, 1)]
@@ -274,6 +277,6 @@ def test_lower_bound_is_pooled_over_the_first_trials_or_rows(monkeypatch, varies
 def test_failed_run_is_not_met_even_without_requirements(status):
     """`ptsmc simulate` then has exit status 1."""
     none: Any = None
-    run = runs.Run(none, none, {}, {}, "ok", "", math.nan, [], {})
+    run = runs.Run(none, none, {}, {}, "ok", "", math.nan, [], {}, {})
     assert run.met
     assert not replace(run, status=status).met

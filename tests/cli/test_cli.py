@@ -51,13 +51,19 @@ def test_simulate_writes_its_result_folder(command, tmp_path):
     assert summary["status"] == "ok"
     assert {name for name, entry in catalogues.CATALOGUE.items() if entry.table is None} <= set(summary)
     assert summary["peak_torque"] == pytest.approx(np.abs(values[:, 11:14]).max(), rel=1e-12)
-    first, second, *_ = out.splitlines()
+    first, second, third, *_ = out.splitlines()
     assert (
         first
         == f"pointing error {formats.format_error(summary['window_error'], 'spacecraft')}: every requirement is met"
     )
     bound = formats.format_error(summary["lower_bound"], "spacecraft")  # of an RMS, so it has no ratio to one trial
     assert second.startswith(f"lower bound of the RMS error of many trials: {bound}; ")
+    drawn, start = summary["drawn"], [*values[0, 1:8]]
+    assert list(drawn) == ["initial_angle", *(f"initial_{name}" for name in header.split(",")[1:8])]
+    np.testing.assert_allclose([one["value"] for one in drawn.values()][1:], start, rtol=1e-12)
+    assert [one["unit"] for one in drawn.values()] == ["rad", *4 * ["-"], *3 * ["rad/s"]]
+    angle = np.degrees(drawn["initial_angle"]["value"])
+    assert third.startswith(f"initial_angle {angle:.6g} deg in this trial; summary.json has ")
     assert scenario.read(folder / "scenario.toml") == scenario.read(tmp_path / "s.toml")
     made = json.loads((folder / "versions.json").read_text())
     assert (made["command"], made["seed"], made["trial"]) == ("simulate", 7, 3)

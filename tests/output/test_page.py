@@ -67,6 +67,7 @@ def test_a_run_becomes_a_page(command, simulated):
     assert f"peak_torque {summary['peak_torque']:.5g} N m" in read.text
     assert summary["settling_time"] is None
     assert "settling_time never s" in read.text
+    assert f"initial_w2 {summary['drawn']['initial_w2']['value']:.6g} rad/s" in read.text
     assert "ptsmc simulate s.toml --trial 3 --seed 5" in read.text
     assert (simulated / "scenario.toml").read_text().split("\n")[0] in read.text
     rows = np.genfromtxt(simulated / "trajectory.csv", delimiter=",", names=True)

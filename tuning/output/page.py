@@ -234,7 +234,10 @@ def _charts(result: Result) -> dict[str, list[Block]]:
     """Return the charts and the table that only the page shows, by the titles of their sections."""
     command = result.versions["command"]
     if command == "simulate":
-        return {"History": _history_charts(result)}
+        with reports.name_in_errors(result.source):
+            trial = reports.drawn_table(summaries.run(result.summary, result.plant))
+        charts: dict[str, list[Block]] = {"History": _history_charts(result)}
+        return {**charts, "Trial": [trial]} if trial.rows else charts
     if command == "tune":
         return {"Search": [_search_chart(result)]}
     if command == "montecarlo":

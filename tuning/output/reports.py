@@ -77,6 +77,9 @@ def run_report(summary: summaries.Run, plant: str) -> Report:
     if summary.reason:
         when = "" if summary.bad_time is None else f", at {summary.bad_time:.4g} s"
         lines.append(f"status {summary.status}: {summary.reason}{when}")
+    if summary.drawn:
+        angle = " ".join(next(row for row in drawn_table(summary).rows if row[0] == "initial_angle")).rstrip(" -")
+        lines.append(f"{angle} in this trial; summary.json has its initial state and dispersions under drawn")
     if summary.controller_statuses:
         lines.append(f"samples of the controller: {list_counts(summary.controller_statuses)}")
     missing = "never" if summary.status in ("ok", "not_converged") else "-"
@@ -88,6 +91,15 @@ def run_report(summary: summaries.Run, plant: str) -> Report:
     metrics = Section("Metrics", [Table(("metric", "value", "unit", "meaning"), rows)])
     sections = [*report.requirement_sections(summary.verdicts), metrics]
     return Report(headline, mood, [*lines, *report.warning_lines(summary.warnings)], sections)
+
+
+def drawn_table(summary: summaries.Run) -> Table:
+    """Return the table of the initial state and the dispersions of a trial."""
+    rows = []
+    for name, entry in summary.drawn.items():
+        unit, (value,) = in_readable_unit(name, entry["unit"], entry["value"])
+        rows.append((name, format_number(value, ".6g"), unit))
+    return Table(("quantity", "value", "unit"), rows)
 
 
 def paper_report(summary: Mapping[str, Any]) -> Report:

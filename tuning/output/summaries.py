@@ -62,6 +62,7 @@ class Run(msgspec.Struct, frozen=True, kw_only=True):
     metrics: Numbers
     verdicts: list[Entry]
     warnings: list[str]
+    drawn: dict[str, Row] = {}  # value and unit of the initial state and of each dispersion, by column
     controller_statuses: dict[str, int] = {}
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.runs import Run
+from ptsmc_jax.dispersions import quantities
 from ptsmc_jax.onboard import sources
 from ptsmc_jax.scenario import aem as attitude_messages
 from ptsmc_jax.scenario import custom, parsing, plausibility
@@ -46,7 +47,10 @@ def summary(run: Run, scenario: Scenario, computer: "InTheLoop | None" = None) -
         warnings += [computer.parameter_differences] if computer.parameter_differences else []
         statuses = {name: count for name, count in run.samples.items() if count}
         controller_entries = {"controller_statuses": statuses, "controller": computer.library.checksum}
-    assessment = {"lower_bound": lower_bound, "verdicts": verdicts, "warnings": warnings}
+    unit_of = quantities.units(run.parts)
+    names = [name for name in {**unit_of, **run.drawn} if name in run.drawn]  # in the order of the dispersions
+    drawn = {name: {"value": run.drawn[name], "unit": unit_of.get(name, "")} for name in names}
+    assessment = {"lower_bound": lower_bound, "verdicts": verdicts, "warnings": warnings, "drawn": drawn}
     return {**heading, **run.metrics, **assessment, **controller_entries}
 
 
