@@ -318,7 +318,7 @@ def test_damaged_part_is_reported_and_simulated_again(command, simulated, tmp_pa
     whole = rows_of(simulated)
     part = sorted((simulated / "trials").iterdir())[1]
     part.write_bytes(part.read_bytes()[:-100])
-    for asked in (["summarize", FOLDER], ["worst", FOLDER], ["replay", FOLDER, "--trial", 120]):
+    for asked in (["summarize", FOLDER], ["worst", FOLDER], ["replay", FOLDER, "--trial", 120], ["report", FOLDER]):
         error = refused(command, tmp_path, *asked)
         assert part.name in error
         assert "damaged" in error

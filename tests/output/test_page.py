@@ -236,6 +236,7 @@ def test_what_is_no_result_is_refused(command, simulated, tmp_path):
             "[]",
             "run holds no result, or its versions.json is damaged; allowed is a folder",
         ),
+        ("versions.json", '{"command": "export"}', "run has exported code, which has no page; allowed is a folder"),
         ("versions.json", '{"command": ["x"]}', "run holds no result"),
         ("scenario.toml", None, "the scenario file run/scenario.toml does not exist"),
         ("scenario.toml", "a = [", "the scenario file run/scenario.toml is no valid TOML: "),

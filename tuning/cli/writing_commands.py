@@ -22,7 +22,7 @@ def report(
 ) -> int:
     """Write the results of a folder as one self-contained HTML page, DIR/report.html.
 
-    Exit status: 0 done, 2 configuration error.
+    Exit status: 0 done, 2 configuration error or damaged rows.
     """
     from ptsmc_jax.campaigns import store
     from tuning.output import page

@@ -27,7 +27,7 @@ from ptsmc_jax.simulation.catalogues import CATALOGUES
 from tuning.errors import UsageError
 from tuning.output import campaign_report, compare_report, page_charts, reports, summaries
 from tuning.output.report import Block, Chart, Code, Picture, Section, Table
-from tuning.studies import front
+from tuning.studies import campaign_folder, front
 
 HERE = Path(__file__).parent
 # the table of a finished result, by command
@@ -102,9 +102,10 @@ def read(folder: Path) -> Result:
     versions = store.read_versions(folder)
     command = str(versions.get("command"))
     if command not in reports.REPORTS:
-        raise RefusedError(
-            f"{folder} holds no result, or its versions.json is damaged; allowed is a folder that a ptsmc command wrote"
-        )
+        wrong = "holds no result, or its versions.json is damaged"
+        if command == "export":
+            wrong = "has exported code, which has no page"
+        raise RefusedError(f"{folder} {wrong}; allowed is a folder of `ptsmc {'`, `'.join(reports.REPORTS)}`")
     source = folder / ("map.csv" if command == "map" else store.SUMMARY)
     for path in (source, folder / TABLES.get(command, source.name)):
         if not path.exists():
@@ -112,6 +113,8 @@ def read(folder: Path) -> Result:
             raise RefusedError(
                 f"{path} does not exist: the results of `ptsmc {command}` are incomplete; run the same command {remedy}"
             )
+    if command == "montecarlo":
+        campaign_folder.open_folder(folder).stored_parts()  # raises RefusedError for a damaged part
     with reports.name_in_errors(source):
         is_map = command == "map"
         summary = {"rows": _read_rows(source)} if is_map else msgspec.json.decode(source.read_bytes(), type=dict)
