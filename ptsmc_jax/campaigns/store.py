@@ -189,18 +189,27 @@ def _values_by_key(tables: Tables) -> dict[str, object]:
 
 def check_folder(folder: Path, force: bool) -> None:
     """Raise RefusedError if this folder must not be written to; force: it may have content."""
-    existing = next(path for path in (folder, *folder.parents) if path.exists())
+    existing = _existing_part(folder)
     if not existing.is_dir():
         place = "which" if existing == folder else f"but {existing}"
         raise RefusedError(f"--out is {folder}, {place} is a file; allowed is a new folder")
     if not os.access(existing, os.W_OK):
-        raise RefusedError(
-            f"--out is {folder}, but nothing may be written into {existing}; allowed is a folder elsewhere"
-        )
+        raise _unwritable_error(folder)
     if existing == folder and not force and not is_empty(folder):
         raise RefusedError(
             f"--out is {folder}, which holds something already; allowed is a new folder, or --force to write into it"
         )
+
+
+def _existing_part(folder: Path) -> Path:
+    """Return the folder if it exists, or else the first of its parents that does."""
+    return next(path for path in (folder, *folder.parents) if path.exists())
+
+
+def _unwritable_error(folder: Path) -> RefusedError:
+    """Return the error for a folder that cannot be written to."""
+    existing = _existing_part(folder)
+    return RefusedError(f"--out is {folder}, but nothing may be written into {existing}; allowed is a folder elsewhere")
 
 
 def is_empty(folder: Path) -> bool:
@@ -221,13 +230,15 @@ def lock_folder(folder: Path, *, force: bool = True, shared: bool = False) -> It
 
     Raises:
         InUseError: another process writes into the folder.
-        RefusedError: see `check_folder`.
+        RefusedError: see `check_folder`, or no file can be created.
     """
     check_folder(folder, force=True)  # before a folder or a file is made
     path = _lock_file_path(folder)
     new_parents = [parent for parent in path.parents if not parent.exists()]
     lock = _open_locked(path, shared=shared)
     if lock is None:
+        if not path.exists():  # a file system without new files, such as /proc
+            raise _unwritable_error(folder)
         raise InUseError(f"{folder} is in use by another ptsmc process; wait for its end, or choose another folder")
     try:
         check_folder(folder, force)

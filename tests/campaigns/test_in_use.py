@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -136,6 +137,16 @@ def test_commands_do_not_write_into_a_folder_in_use(command, tmp_path, asked):
         assert (code, said, error.count("\n")) == (2, "", 1)
         assert error.startswith("ptsmc: out is in use by another ptsmc process")
     assert tree(tmp_path) == before
+
+
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="the system has no /proc")
+def test_a_folder_that_takes_no_files_is_not_in_use():
+    """No file can be created in /proc, although its permissions allow it."""
+    with (
+        pytest.raises(store.RefusedError, match="nothing may be written into /proc;"),
+        store.lock_folder(Path("/proc/x")),
+    ):
+        pass
 
 
 def test_shards_of_one_folder_run_at_the_same_time(command, tmp_path, monkeypatch):
