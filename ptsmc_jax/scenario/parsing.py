@@ -186,14 +186,17 @@ def _unknown_table_error(name: str, value: object, kind: str) -> ScenarioError:
     if isinstance(value, Mapping):
         hint = nearest_name_hint(name, (*layout, "requirements"), "[{}]")
         return ScenarioError(f"[{name}] is not a known table; {hint}")
-    tables_of_key = keys.table_names_by_key(layout)
+    return ScenarioError(f"{show_key(name)} = {brief(value)} is outside of any table; {nearest_keys_hint(name, kind)}")
+
+
+def nearest_keys_hint(name: str, kind: str) -> str:
+    """Return a hint for a key without its table: the nearest known keys with their tables; kind: of the plant."""
+    tables_of_key = keys.table_names_by_key(TABLES[kind])
     closest = difflib.get_close_matches(name.lower(), tables_of_key, n=1)
     tables = [table for table in tables_of_key[closest[0]] if table not in TABLES_OF_NAMES] if closest else []
     places = [f"{table}.{closest[0]}" for table in tables]
     hint = f"the nearest known {'keys are' if places[1:] else 'key is'} {', '.join(places)}"
-    return ScenarioError(
-        f"{show_key(name)} = {brief(value)} is outside of any table; {hint if places else 'no table has such a key'}"
-    )
+    return hint if places else "no table has such a key"
 
 
 def dump(scenario: Scenario) -> dict[str, Any]:

@@ -223,6 +223,8 @@ NUMBERS = {
         (("tune", "far.toml"), ("initial.rotvec_deg is",)),
         (("map", "s.toml", "--trials", "2.5"), ("for --trials: 2.5 is no whole number",)),
         (("simulate", "s.toml", "--out", "folder"), ("folder, which holds something already",)),
+        # the argument first, so that it does not take another try after a change of the folder
+        (("map", "s.toml", "--out", "folder", "--x", "a"), ("--x is a, but must be KEY=LOW:HIGH:COUNT",)),
         (("simulate", "--seed"), ("--seed", "requires an argument")),
         (("simulate", "--out"), ("--out", "requires an argument")),
         (("simulate", "--sed", "1"), ("--sed", "--seed")),

@@ -130,6 +130,15 @@ def test_invalid_axes_are_refused(text):
         mapping.parse_axis(text, "--y")
 
 
+@pytest.mark.parametrize(("plant", "key", "nearest"), [
+    ("spacecraft", "torque_limit", "the nearest known keys are hardware.torque_limit, wheels.torque_limit"),
+    ("chain", "etta", "the nearest known key is controller.eta"),
+])  # fmt: skip
+def test_the_refusal_of_a_key_without_its_table_names_the_nearest_keys(plant, key, nearest):
+    with pytest.raises(UsageError, match=re.escape(nearest)):
+        mapping.parse_axis(f"{key}=1:2:3", "--x", plant)
+
+
 @pytest.fixture(scope="module")
 def mapped():
     return simulated("loop.period=0.05:0.2:2", "controller.delta=0.1:0.5:2", CHAIN)

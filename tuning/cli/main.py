@@ -61,9 +61,7 @@ def simulate(
         trial: Simulate this dispersed trial; default: nominal parameters with the noise of trial 0.
         aem: Write attitude.aem too, a CCSDS attitude ephemeris message.
     """
-    loaded, folder = prepare(
-        scenario, "simulate", out, trust=common.trust, force=common.force, in_c=controller is not None
-    )
+    loaded, folder = prepare(scenario, "simulate", out, trust=common.trust, in_c=controller is not None)
     from ptsmc_jax.campaigns import runs, store
     from ptsmc_jax.scenario import study, timing
     from ptsmc_jax.simulation.computer import PYTHON_SOFTWARE
@@ -71,6 +69,7 @@ def simulate(
 
     if aem and loaded.motion != "spacecraft":
         raise UsageError("--aem is given, but the plant is no spacecraft and has no attitude")
+    store.check_folder(folder, common.force)
     ready = study(loaded, drawn=trial is not None)
     computer = None
     if controller is not None:
@@ -136,12 +135,12 @@ def map_(
         y: KEY=LOW:HIGH:COUNT; default: delta from a period to t_f / 7, or the law's first gain.
         trials: Trials of each pair, 1 to 1000000.
     """
-    loaded, folder = prepare(scenario, "map", out, device, trust=common.trust, force=common.force)
+    loaded, folder = prepare(scenario, "map", out, device, trust=common.trust)
     from ptsmc_jax.campaigns import store
     from tuning.studies import mapping
 
-    x_axis = mapping.parse_axis(x or mapping.default_period_axis(loaded), "--x")
-    y_axis = mapping.parse_axis(y or mapping.default_gain_axis(loaded), "--y")
+    x_axis = mapping.parse_axis(x or mapping.default_period_axis(loaded), "--x", loaded.plant.kind)
+    y_axis = mapping.parse_axis(y or mapping.default_gain_axis(loaded), "--y", loaded.plant.kind)
     if x_axis.key == y_axis.key:
         raise UsageError(f"--y is {y_axis.text}, but must be another key than --x")
     with store.lock_folder(folder, force=common.force):

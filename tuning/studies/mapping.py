@@ -81,7 +81,7 @@ class Map:
         return np.array([getattr(cell, name) for cell in self.cells]).reshape(len(self.y.values), len(self.x.values))
 
 
-def parse_axis(text: str, option: str) -> Axis:
+def parse_axis(text: str, option: str, plant: str = "spacecraft") -> Axis:
     """Parse an axis from KEY=LOW:HIGH:COUNT, such as controller.delta=0.05:3:9.
 
     The values have equal ratios if HIGH exceeds `LOGARITHMIC_SPAN` times LOW, otherwise equal differences. KEY[0]
@@ -90,11 +90,14 @@ def parse_axis(text: str, option: str) -> Axis:
     Args:
         text: value of the option.
         option: name of the option in error messages, "--x" or "--y".
+        plant: kind of the plant, whose keys are proposed if the key has no table.
     """
     key, _, span = text.partition("=")
     parts = span.split(":")
     examples = "controller.delta=0.05:3:9 or observer.gain[0]=5:10:3"
     message = f"{option} is {text}, but must be KEY=LOW:HIGH:COUNT, such as {examples}"
+    if re.fullmatch(r"\w+", key):
+        message += f"; {parsing.nearest_keys_hint(key, plant)}"
     if len(parts) != 3 or not re.fullmatch(r"\w+\.\w+(\[\d+\])?", key):
         raise UsageError(message)
     try:
