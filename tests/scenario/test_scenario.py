@@ -60,7 +60,6 @@ def test_a_chain_is_not_offered_disturbances_of_a_spacecraft():
         from_tables(tomllib.loads(text))
 
 
-@pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning")
 @pytest.mark.parametrize(
     "key",
     """controller.t_f controller.eta controller.delta controller.k1 controller.sign_width loop.t_end loop.window

@@ -3,7 +3,6 @@
 import dataclasses
 import io
 import sys
-import warnings
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -349,7 +348,6 @@ for _command in _COMMANDS:
 def main() -> None:
     """Run a command; a configuration error ends it with one sentence and exit status 2, without a traceback."""
     status: object = None
-    warnings.filterwarnings("ignore", "overflow encountered", RuntimeWarning)  # such values are refused in a sentence
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors="backslashreplace")  # like the error stream: file names contain any character
     try:
