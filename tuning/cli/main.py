@@ -1,6 +1,7 @@
 """The `ptsmc` command. Commands that compute import JAX after they have checked their arguments."""
 
 import dataclasses
+import functools
 import io
 import sys
 from pathlib import Path
@@ -308,13 +309,14 @@ def compare(
     rivals.check()
     comparing.check(loaded)
     loaded = posing.with_tune(loaded)
-    contenders = comparing.validated_contenders(loaded, rivals)
+    contenders = functools.cache(lambda: comparing.validated_contenders(loaded, rivals))
     identity = comparing.identity(loaded, seed, rivals) | {"device": device}
     search = searches.LongSearch(
         identity,
         objective_name(loaded.search),
-        work=lambda report, journal: comparing.compare(loaded, seed, report, journal, contenders),
+        work=lambda report, journal: comparing.compare(loaded, seed, report, journal, contenders()),
         write=lambda staging, comparison: comparing.write(staging, loaded, comparison, common.figures, identity),
+        check=contenders,
     )
     return searches.run(search, loaded, folder, force=common.force, quiet=common.quiet)
 

@@ -28,6 +28,7 @@ class LongSearch:
     objective: str  # name of the objective in the progress
     work: Callable[[Progress, "Journal"], Any]  # runs the search; its result has a `status`
     write: Callable[[Path, Any], None]  # writes the result into a result folder
+    check: Callable[[], object] = lambda: None  # raises configuration errors before a search, not before its result
 
 
 def warn_about_seed(scenario: Path, seed: int) -> None:
@@ -63,6 +64,7 @@ def run(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, qu
             if not is_resumed:
                 store.check_folder(folder, force)
             study(loaded)  # raises configuration errors before the search
+            search.check()
             from tuning.search.journal import Journal
 
             journal = Journal(store.begin_run(folder, tables, search.identity, fresh=not is_resumed))
