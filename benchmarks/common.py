@@ -22,7 +22,7 @@ from ptsmc_jax.batching import kernel, lanes
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.scenario import Study
 from ptsmc_jax.simulation import catalogues
-from ptsmc_jax.simulation.clock import Anchored
+from ptsmc_jax.simulation.clock import Sampled
 from ptsmc_jax.simulation.control_period import first_period
 from ptsmc_jax.simulation.rollout import Parts
 
@@ -75,7 +75,7 @@ def medians(
 
 def steps(parts: Parts) -> int:
     """Return the number of control periods of a run, those of length zero included."""
-    assert isinstance(parts.clock, Anchored)
+    assert isinstance(parts.clock, Sampled)
     return parts.clock.before + parts.clock.after
 
 
@@ -165,7 +165,7 @@ class Program:
         k2 = watch.error_bound()
         target = np.asarray(parts.reference(jnp.zeros(())).q)
         first = jnp.sum(jnp.where(ticks.partial, ticks.t_next - ticks.t, 0.0))
-        assert isinstance(clock, Anchored)
+        assert isinstance(clock, Sampled)
         values = [
             parts.plant.inertia, parts.plant.inertia_inverse, target,
             law.t_f, law.eta, law.delta, law.k1, law.sign_width, k2.rate, k2.start, k2.floor,
@@ -199,7 +199,7 @@ class CubesatProgram:
         parts = ready.parts
         clock, law, watch, sensors = parts.clock, parts.controller, parts.observer, parts.sensors
         actuators, d = parts.actuators, parts.disturbance
-        assert isinstance(clock, Anchored)
+        assert isinstance(clock, Sampled)
         assert actuators.wheels is not None
         ticks, k2, device = clock.ticks(law.t_f, law.delta), watch.error_bound(), actuators.wheels
         frame = (np.eye(3), 0.0, 1.0)

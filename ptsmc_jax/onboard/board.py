@@ -401,7 +401,7 @@ def _add_law_stage(computer: Board, law: Law, observer: Observer, command_filter
         law, period, t = parameters["law"], parameters["period"], values["t"]
         memory_before = {name: values[f"before.{name}"] for name in memories}
         now, reference = computer.measured_state(values, "now"), parameters["reference"](t)
-        hold = t >= law.hand_over - guards.time_tolerance(period, law.hand_over)  # the tolerance of `clock.Flight`
+        hold = t >= law.hand_over - guards.time_tolerance(period, law.hand_over)  # the tolerance of `clock.Sampled`
 
         def evaluate_law() -> tuple[jax.Array, jax.Array, Values]:
             sample, k2 = Sample(t, hold, period, memory_before["law"]), parameters["bound"](t)

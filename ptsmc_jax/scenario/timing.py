@@ -103,7 +103,7 @@ def reach_of(scenario: Scenario, **changes: float) -> Reach:
 
 def choose_timing(
     scenario: Scenario, setup: Parts, reach: Reach, saves: object
-) -> tuple[clock.Anchored | clock.Flight | clock.Graded, int]:
+) -> tuple[clock.Sampled | clock.Graded, int]:
     """Return the clock of a run, and the number of integration steps in a control period.
 
     Args:

@@ -37,7 +37,7 @@ class Parts:
     command_filter: CommandFilter | None = None  # filter between the law and the actuators
     jitter: Leaf | None = None  # largest error of a sample time, as a fraction of the control period [-]
     pointing: Pointing | None = None  # observation of pointing errors; None: the run has no pointing metrics
-    clock: Any = None  # `clock.Anchored`, `Flight` or `Graded` (continuous loop); None: not chosen yet
+    clock: Any = None  # `clock.Sampled`, or `Graded` for the continuous loop; None: not chosen yet
     substeps: int = field(default=1, metadata={"static": True})  # RK4 steps of the plant in a control period
 
     def __post_init__(self) -> None:

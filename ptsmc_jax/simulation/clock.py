@@ -1,4 +1,4 @@
-"""Clocks: the sample times of the sampled loop (`Anchored`, `Flight`) and the steps of the continuous loop (`Graded`).
+"""Clocks: the sample times of the sampled loop (`Sampled`) and the steps of the continuous loop (`Graded`).
 
 Each clock turns t_f and delta into `Ticks`, which are intervals in order of time. Their number is fixed when the clock
 is built. Intervals before t = 0 or after t_end have length zero and change nothing.
@@ -35,70 +35,60 @@ def _full_intervals(t: Array, t_next: Array, hold: Array) -> Ticks:
 
 @pytree
 @dataclass(frozen=True)
-class Anchored:
-    """Control clock with a sample at the hand-over t_s: t_k = t_s + (k - before) period.
+class Sampled:
+    """Control clock of a sampled loop: an anchored clock, or the clock of a flight computer.
 
-    All samples and their noise move with t_s, so a run depends smoothly on delta and t_f. The first period, from t = 0,
-    is partial. Its noise is blended with the noise of the next sample, so that no state jumps when the partial period
-    vanishes. At that point derivatives by delta and t_f are one-sided, and the chattering jumps by the contribution of
-    one sample.
+    Anchored clock: sample k is at the hand-over plus (k - before) periods, so all samples and their noise move with the
+    hand-over. A run depends smoothly on delta and t_f. The first period, from t = 0, is partial. Its noise is blended
+    with the noise of the next sample, so that no state jumps when the partial period vanishes. At that point
+    derivatives by delta and t_f are one-sided, and the chattering jumps by the contribution of one sample.
+
+    Flight clock: sample k is at k periods from t = 0. The hand-over is the first sample at or after t_f - delta.
+
+    Clocks of both kinds with the same numbers of samples share compiled programs.
     """
 
     period: Leaf  # h [s]
     t_end: Leaf  # [s]
-    before: int = field(metadata={"static": True})  # number of samples before the hand-over, at least t_s / period
-    after: int = field(metadata={"static": True})  # number of samples at and after the hand-over
+    anchored: Leaf  # 1: anchored clock; 0: flight clock
+    # number of samples before the hand-over of an anchored clock, at least (t_f - delta) / period
+    before: int = field(metadata={"static": True})
+    after: int = field(metadata={"static": True})  # number of further samples
     sampled: ClassVar[bool] = True
-    anchored: ClassVar[bool] = True
 
     @property
     def count(self) -> int:
         """The number of samples."""
         return self.before + self.after
 
-    def long_enough_for(self, clocks: Sequence["Anchored"]) -> "Anchored":
+    def long_enough_for(self, clocks: Sequence["Sampled"]) -> "Sampled":
         """Return this clock with as many samples before and after the hand-over as the longest of several clocks."""
         return replace(self, before=max(clock.before for clock in clocks), after=max(clock.after for clock in clocks))
 
+    def sized_as(self, other: "Sampled") -> "Sampled":
+        """Return this flight clock with the numbers of samples of another clock, so that both share programs."""
+        return replace(self, before=other.before, after=other.after) if self.count <= other.count else self
+
     def ticks(self, t_f: Scalar, delta: Scalar) -> Ticks:
         """Control periods for this prescribed time and delta [s]."""
-        sample = jnp.arange(-self.before, self.after, dtype=jnp.int32)
+        is_anchored, tolerance = jnp.asarray(self.anchored) > 0.5, guards.time_tolerance(self.period, t_f)
+        numbers = jnp.arange(self.count + 1)
         # one array of nodes, so that each interval ends exactly where the next begins
-        nominal = (t_f - delta) + jnp.arange(-self.before, self.after + 1).astype(float) * self.period
+        anchored_nodes = (t_f - delta) + (numbers - self.before).astype(float) * self.period
+        nominal = jnp.where(is_anchored, anchored_nodes, numbers.astype(float) * self.period)
         # rounding may put the sample at t = 0 slightly after it; then there would be two samples
-        has_started = nominal > guards.time_tolerance(self.period, t_f)
+        has_started = ~is_anchored | (nominal > tolerance)
         nodes = _limit_time(
             jnp.where(has_started, nominal, 0.0), self.t_end, guards.time_tolerance(self.period, self.t_end)
         )
         t, t_next = nodes[:-1], nodes[1:]
+        sample = jnp.arange(self.count, dtype=jnp.int32) - jnp.where(is_anchored, self.before, 0).astype(jnp.int32)
         # the start of a period decides, because rounding may make its length equal to a full period or longer
         partial = ~has_started[:-1]
         fraction = jnp.where(partial, (t_next - t) / self.period, 1.0)
-        return Ticks(t, t_next, sample >= 0, sample, fraction, partial)
-
-
-@pytree
-@dataclass(frozen=True)
-class Flight:
-    """Control clock of flight software: samples at k period from t = 0, hand-over at the first sample from t_s on."""
-
-    period: Leaf  # h [s]
-    t_end: Leaf  # [s]
-    count: int = field(metadata={"static": True})  # number of samples, at least t_end / period
-    sampled: ClassVar[bool] = True
-    anchored: ClassVar[bool] = False
-
-    def long_enough_for(self, clocks: Sequence["Flight"]) -> "Flight":
-        """Return this clock with as many samples as the longest of several clocks."""
-        return replace(self, count=max(clock.count for clock in clocks))
-
-    def ticks(self, t_f: Scalar, delta: Scalar) -> Ticks:
-        """Control periods for this prescribed time and delta [s]."""
-        nominal = jnp.arange(self.count + 1).astype(float) * self.period
-        nodes = _limit_time(nominal, self.t_end, guards.time_tolerance(self.period, self.t_end))
-        t, t_next = nodes[:-1], nodes[1:]
-        hold = t >= t_f - delta - guards.time_tolerance(self.period, t_f)  # rounding must not delay the hand-over
-        return _full_intervals(t, t_next, hold)
+        # rounding must not delay the hand-over of a flight computer
+        hold = jnp.where(is_anchored, sample >= 0, t >= t_f - delta - tolerance)
+        return Ticks(t, t_next, hold, sample, fraction, partial)
 
 
 @pytree
@@ -116,7 +106,7 @@ class Graded:
     before: int = field(metadata={"static": True})  # number of steps before the hand-over; more than t_s / max_step
     after: int = field(metadata={"static": True})  # number of steps after the hand-over
     sampled: ClassVar[bool] = False
-    anchored: ClassVar[bool] = False
+    anchored: ClassVar[float] = 0.0
 
     @property
     def count(self) -> int:
@@ -173,15 +163,15 @@ class Graded:
         return (t_f - jnp.exp(u)).at[0].set(0.0).at[-1].set(t_f - delta)
 
 
-def anchored_clock(period: float, t_end: float, t_f_max: float, longest_after: float) -> Anchored:
+def anchored_clock(period: float, t_end: float, t_f_max: float, longest_after: float) -> Sampled:
     """Return the anchored clock for t_f up to `t_f_max` and a hand-over at most `longest_after` before t_end, in s."""
     before, after = math.ceil(t_f_max / period), math.ceil(longest_after / period) + 1
-    return Anchored(vector(period), vector(t_end), before, after)
+    return Sampled(vector(period), vector(t_end), vector(1.0), before, after)
 
 
-def flight_clock(period: float, t_end: float) -> Flight:
+def flight_clock(period: float, t_end: float) -> Sampled:
     """Return the flight clock; period and t_end in s."""
-    return Flight(vector(period), vector(t_end), math.ceil(t_end / period))
+    return Sampled(vector(period), vector(t_end), vector(0.0), 0, math.ceil(t_end / period))
 
 
 def graded_clock(

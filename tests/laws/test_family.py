@@ -284,7 +284,7 @@ def chain_run(law, x0, period=0.01, noise=0.0, disturbance=(0.0, 1.0, 0.0, 0.0),
     a, w, p, b = (vector([v]) for v in disturbance)
     run = helpers.chain_parts(x0, T_F, delta=DELTA, period=period, noise=(noise, noise), bound=bound,
                               disturbance=disturbances.Sinusoid(a, w, p, b))  # fmt: skip
-    timing = clock.Anchored(vector(period), run.t_end, 1000, 520)
+    timing = clock.Sampled(vector(period), run.t_end, vector(1.0), 1000, 520)
     return replace(run, controller=law, clock=timing)
 
 

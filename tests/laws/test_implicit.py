@@ -252,7 +252,7 @@ def test_rounding_errors_do_not_delay_the_surface_of_the_hold_phase(bits):
     law = chain_parts(clock="flight").controller
 
     def first_hold_period(period, t_f, delta):
-        ticks = clock.Flight(period, count * period, count).ticks(t_f, delta)
+        ticks = clock.Sampled(period, count * period, 0.0, 0, count).ticks(t_f, delta)
         return jnp.argmax(replace(law, t_f=t_f, delta=delta).in_hold(ticks.t, ticks.t + period, ticks.hold))
 
     with jax.enable_x64(bits == 64):

@@ -17,7 +17,8 @@ from tests.helpers import ticks_of, vector
 @given(t_f=st.floats(5.0, 40.0), share=st.floats(0.01, 0.4), coast=st.floats(1.0, 12.0))
 def test_anchored_periods_cover_the_run_and_have_a_sample_at_the_hand_over(t_f, share, coast):
     period, delta = 0.1, max(share * t_f, 0.1)
-    ticks = ticks_of(clock.Anchored(vector(period), vector(t_f + coast), 401, 400), vector(t_f), vector(delta))
+    times = clock.Sampled(vector(period), vector(t_f + coast), vector(1.0), 401, 400)
+    ticks = ticks_of(times, vector(t_f), vector(delta))
     t, t_next = np.asarray(ticks.t), np.asarray(ticks.t_next)
     assert np.all(t_next >= t)
     assert t[0] == 0.0
@@ -136,6 +137,17 @@ def test_the_flight_clock_starts_at_zero_and_its_hold_phase_at_the_first_sample_
     assert float(on_sample.t[np.argmax(on_sample.hold)]) == pytest.approx(9.0)
 
 
+def test_flight_clock_sized_as_an_anchored_clock_has_the_same_periods_and_the_same_structure():
+    flight, anchored = clock.flight_clock(0.1, 15.04), clock.anchored_clock(0.1, 15.04, 10.0, 8.0)
+    sized = flight.sized_as(anchored)
+    assert jax.tree.structure(sized) == jax.tree.structure(anchored)
+    ticks, longer = (ticks_of(one, vector(10.0), vector(1.07)) for one in (flight, sized))
+    for short, long in zip(ticks, longer, strict=True):
+        np.testing.assert_array_equal(long[: flight.count], short)
+    np.testing.assert_array_equal(longer.t_next[flight.count :], longer.t[flight.count :])
+    assert flight.sized_as(clock.flight_clock(0.1, 9.0)).count == flight.count
+
+
 @pytest.mark.parametrize(("t_f", "delta"), [(30.0, 0.05), (0.5, 0.001), (3000.0, 2.0), (10.0, 5.0)])
 def test_the_graded_grid_has_the_documented_nodes_and_steps(t_f, delta):
     saves = [0.3 * t_f, t_f - delta, t_f + 0.5]
@@ -185,7 +197,7 @@ def test_rounding_removes_no_period_in_32_or_64_bits(bits):
     t_end, t_f, delta = np.broadcast_arrays(count * period, (count - 100) * period, before * period)
 
     def handed_over(period, t_end, t_f, delta):
-        ticks = clock.Flight(period, t_end, count).ticks(t_f, delta)
+        ticks = clock.Sampled(period, t_end, 0.0, 0, count).ticks(t_f, delta)
         return (
             jnp.argmax(ticks.hold),
             rollout._first_time_without_samples(ticks, t_end),

@@ -290,13 +290,13 @@ def rivals(monkeypatch, eight, interrupt=None):
         asked.append(("tune", law, seed))
         return SimpleNamespace(tuned=posed, gains={}, at_bound={}, held_out={"tuned": eight}, verdicts=[],
                                lower_bounds={"tuned": None},
-                               search=SimpleNamespace(interrupted=law == interrupt))  # fmt: skip
+                               search=SimpleNamespace(interrupted=law == interrupt, problem=None))  # fmt: skip
 
     def judge(simulated, seed):
         asked.append(("judge", "published", seed))
         return eight
 
-    monkeypatch.setattr(compare, "_add_margins_and_model_errors", lambda one, seed: one)
+    monkeypatch.setattr(compare, "_add_margins_and_model_errors", lambda one, *_: one)
     monkeypatch.setattr(tuner, "tune", tune)
     monkeypatch.setattr(judging, "judge", judge)
     return asked

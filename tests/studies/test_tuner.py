@@ -89,7 +89,7 @@ def test_tuning_of_delta_or_t_f_uses_the_anchored_clock(free, anchored):
     tables = tomllib.loads(SHORT_CHAIN) | {"tune": {"free": free, "bounds": {name: bounds[name] for name in free}}}
     simulated = scenario.replace(scenario.from_tables(tables), loop__clock="flight")
     posed = posing.set_up_tuning(simulated, 0)
-    assert posed.problem.parts.clock.anchored is anchored
+    assert posed.problem.parts.clock.anchored == anchored
     assert posed.ready.scenario == (scenario.from_tables(tables) if anchored else simulated)
 
 
@@ -264,11 +264,27 @@ def test_requirements_broken_by_more_accurate_gains_are_listed(monkeypatch):
 
     def broken_by(published, before):
         held_out: Any = {"tuned": tuned, "published": published, "before": before}
-        return tuner._find_broken_requirements(cast(Any, names), held_out, 0)
+        return tuner._find_broken_requirements(cast(Any, names), held_out, 0, cast(Any, None))
 
     assert broken_by(simulated([1.0, 2.0]), simulated([1.0, 1.0])) == {"published": ["gain_margin"], "before": []}
     assert broken_by(simulated([3.0, 2.0]), simulated([2.0, 2.0])) == {}
     assert [*broken_by(simulated([1.0, 9.0], (True, False)), simulated([0.0, 0.0], (False, False)))] == ["published"]
+
+
+@pytest.mark.parametrize("gain", [[0.02], [0.02, 0.03, 0.04]])
+def test_held_out_trials_of_the_search_program_equal_those_of_a_campaign(gain):
+    """The second case has different gains on each axis, which the tuned gain of all axes cannot represent."""
+    tables = tomllib.loads(FIRST_FLIGHT.read_text()) | {"tune": {"free": ["delta", "observer_gain"]}}
+    tables["pointing"] = {"boresight": [0.0, 0.0, 1.0], "window": 1.0}
+    tables["requirements"] = {"ape_boresight": "0.1 deg"}
+    loaded = scenario.replace(scenario.from_tables(tables), observer__gain=gain * (3 // len(gain)))
+    problem = posing.set_up_tuning(loaded, 0).problem
+    assert problem.parts.clock.anchored
+    judged, campaign = judging.judge(loaded, 5, problem), judging.judge(loaded, 5)
+    np.testing.assert_array_equal(judged.status, campaign.status)
+    assert "ape_boresight" in judged.metrics
+    for name, values in judged.metrics.items():
+        np.testing.assert_allclose(values, campaign.metrics[name], rtol=1e-9, atol=1e-15, err_msg=name)
 
 
 def test_judging_changes_only_the_clock():

@@ -30,7 +30,7 @@ from ptsmc_jax.simulation.requirements import Verdict
 from tuning.errors import UsageError
 from tuning.search import custom_parts, gains
 from tuning.search.journal import Journal
-from tuning.search.objective import T_F
+from tuning.search.objective import T_F, Problem
 from tuning.search.progress import Report, headed
 from tuning.studies import judging, stability, tuner
 
@@ -221,10 +221,12 @@ def perturbed_scenarios(simulated: Scenario) -> dict[str, Scenario]:
     return variants
 
 
-def _add_margins_and_model_errors(contender: Contender, held_out_seed: int) -> Contender:
+def _add_margins_and_model_errors(
+    contender: Contender, held_out_seed: int, problem: Problem | None = None
+) -> Contender:
     """Return the contender with its stability margins, and with its trials under each of the `MODEL_ERRORS`."""
     variants = perturbed_scenarios(contender.simulated)
-    changed = {name: judging.judge(variant, held_out_seed) for name, variant in variants.items()}
+    changed = {name: judging.judge(variant, held_out_seed, problem) for name, variant in variants.items()}
     margins = stability.worst_margins(study(contender.simulated))
     return dataclasses.replace(contender, margins=margins, changed=changed)
 
@@ -271,7 +273,7 @@ def compare(
         if interrupted:
             break
         law_report("simulating a wrong inertia and a longer delay", 0, 0, np.nan, 0.0)
-        results[law] = _add_margins_and_model_errors(results[law], held_out_seed)
+        results[law] = _add_margins_and_model_errors(results[law], held_out_seed, tuned.search.problem)
     return Comparison(results, held_out_seed, interrupted, published_error)
 
 

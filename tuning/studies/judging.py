@@ -4,6 +4,7 @@ The tuned gains are compared with the published gains and with the scenario's or
 `verdicts_of`.
 """
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -17,7 +18,9 @@ from ptsmc_jax.scenario.tables import Limit, Scenario
 from ptsmc_jax.scenario.timing import Reach
 from ptsmc_jax.simulation import requirements
 from ptsmc_jax.simulation.requirements import Verdict
-from tuning.search import confirm, gains, trust
+from tuning.search import confirm, gains, simulations, trust
+from tuning.search.objective import Problem, coordinates_of
+from tuning.search.simulations import Batch
 
 
 def derive_held_out_seed(seed: int, turn: int = 0) -> int:
@@ -46,17 +49,47 @@ def reference_scenarios(scenario: Scenario) -> tuple[dict[str, Scenario], str | 
     return {"published": published} | ({"before": scenario} if gains.controls_differ(scenario, published) else {}), None
 
 
-def judge(scenario: Scenario, held_out_seed: int, reach: Reach | None = None) -> Trials:
+def judge(scenario: Scenario, held_out_seed: int, problem: Problem | None = None, reach: Reach | None = None) -> Trials:
     """Simulate a scenario on its held-out trials, on the flight clock.
+
+    The program of the search simulates the trials if it serves the scenario, too. The results then have only the
+    pointing metrics that the problem needs.
 
     Args:
         scenario: scenario with the gains.
         held_out_seed: seed of the held-out trials.
+        problem: the tuning problem of the search; None: there was no search.
         reach: ranges of the gains that share a compiled program; None: those of the scenario.
     """
-    simulated = study(on_flight_clock(scenario), reach=reach)
+    simulated = _on_flight_clock(scenario, problem, reach)
     trials = np.arange(count_held_out_trials(simulated))
-    return montecarlo.run(simulated.parts, simulated.dispersion, held_out_seed, trials)
+    if problem is None or not scenario.sampled:
+        return montecarlo.run(simulated.parts, simulated.dispersion, held_out_seed, trials)
+    gain_values = np.asarray(gains.present_values(simulated.parts, problem.names))
+    same = gains.with_gains(simulated.parts, dict(zip(problem.names, gain_values, strict=True)))
+    if gains.gains_of(same) != gains.gains_of(simulated.parts):  # an axis differs from the mean of the axes
+        return montecarlo.run(simulated.parts, simulated.dispersion, held_out_seed, trials)
+    coordinates = coordinates_of(simulated.dispersion, held_out_seed, trials)
+    batch = Batch(
+        simulated.parts,
+        simulated.dispersion,
+        held_out_seed,
+        problem.names,
+        trials.astype(np.uint32),
+        coordinates,
+        problem.batch.pointing,
+    )
+    return simulations.simulate_trials(batch, gain_values)
+
+
+def _on_flight_clock(scenario: Scenario, problem: Problem | None, reach: Reach | None = None) -> Study:
+    """Return the scenario ready to simulate on the flight clock, with as many samples as the problem if possible."""
+    simulated = study(on_flight_clock(scenario), reach=reach)
+    if problem is None or not scenario.sampled:
+        return simulated
+    parts = simulated.parts
+    parts = dataclasses.replace(parts, clock=parts.clock.sized_as(problem.parts.clock))
+    return dataclasses.replace(simulated, parts=parts)
 
 
 def rms_lower_bound(scenario: Scenario, held_out_seed: int) -> float | None:
@@ -64,15 +97,18 @@ def rms_lower_bound(scenario: Scenario, held_out_seed: int) -> float | None:
     return runs.rms_lower_bound(study(on_flight_clock(scenario)), held_out_seed)
 
 
-def verdicts_of(scenario: Scenario, trials: Trials, held_out_seed: int) -> list[Verdict]:
+def verdicts_of(
+    scenario: Scenario, trials: Trials, held_out_seed: int, problem: Problem | None = None
+) -> list[Verdict]:
     """Return the verdicts on the requirements, and on the required margins of the loop.
 
     Args:
         scenario: scenario with the requirements and the gains.
         trials: the held-out trials of these gains.
         held_out_seed: seed of these trials.
+        problem: the tuning problem of the search, see `judge`.
     """
-    ready = study(on_flight_clock(scenario))
+    ready = _on_flight_clock(scenario, problem)
     # one nominal trial is judged as a number, because a required fraction of the trials has no meaning for it
     selection = 0 if trials.status.size == 1 else slice(None)
 

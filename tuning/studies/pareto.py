@@ -58,13 +58,13 @@ def trace(trade: Trade, seed: int, report: Report = lambda *_: None, journal: Jo
         tuned_gains, value = setup.rounded_gains(chosen[k].normalised), targets[k].value
         tuned = trade.tuned_scenario(value, tuned_gains)
         point = Point(value, tuned_gains, trained=chosen[k].value)
-        judged.append(_judge_point(trade, point, tuned, held_out_seed, reach))
+        judged.append(_judge_point(trade, point, tuned, held_out_seed, setup.problem, reach))
     references, published_error = judging.reference_scenarios(trade.scenario) if trade.compares_points else ({}, None)
     scenario = trade.scenario
 
     def judge_reference(compared: Scenario) -> Point:
         point = Point(np.nan, gains.gains_of(study(compared).parts))
-        return _judge_point(trade, point, compared, held_out_seed, reach)[0]
+        return _judge_point(trade, point, compared, held_out_seed, setup.problem, reach)[0]
 
     points = mark_points(judged) if trade.compares_points else [point for point, _ in judged]
     others = {name: judge_reference(compared) for name, compared in references.items()}
@@ -90,11 +90,13 @@ def trace(trade: Trade, seed: int, report: Report = lambda *_: None, journal: Jo
     )
 
 
-def _judge_point(trade: Trade, point: Point, tuned: Scenario, seed: int, reach: Reach | None) -> JudgedPoint:
+def _judge_point(
+    trade: Trade, point: Point, tuned: Scenario, seed: int, problem: Problem, reach: Reach | None
+) -> JudgedPoint:
     """Return a point with its results on the held-out trials of this seed, and these trials."""
-    trials = judging.judge(tuned, seed, reach)
+    trials = judging.judge(tuned, seed, problem, reach)
     rms, interval = judging.rms_window_error(trials)
-    met = judging.meets_requirements(judging.verdicts_of(tuned, trials, seed), trials)
+    met = judging.meets_requirements(judging.verdicts_of(tuned, trials, seed, problem), trials)
     costs = trade.costs(tuned, trials, seed)
     results = {"rms": np.nan if rms is None else rms, "interval": interval, "failures": int(np.sum(~trials.ok))}
     return replace(point, costs=costs, meets=met, **results), trials

@@ -23,7 +23,7 @@ from tuning.search.design import ShortestTime, shortest_time
 from tuning.search.global_check import Check
 from tuning.search.journal import Journal
 from tuning.search.local_searches import Step
-from tuning.search.objective import T_F
+from tuning.search.objective import T_F, Problem
 from tuning.search.optimise import Search
 from tuning.search.progress import Report, headed
 from tuning.search.trust import Profile
@@ -161,7 +161,7 @@ def tune(
     )
     candidates = {"tuned": judged.tuned} | {name: judging.on_flight_clock(other) for name, other in references.items()}
     held_out = {"tuned": judged.trials} | {
-        name: judging.judge(other, judged.held_out_seed) for name, other in references.items()
+        name: judging.judge(other, judged.held_out_seed, problem) for name, other in references.items()
     }
     shortest = _find_shortest_time(setup, judged)
     trust_checks, beyond_bounds, at_bound = None, {}, evaluate.bounds.at_bound(outcome.gains)
@@ -180,7 +180,7 @@ def tune(
         seed=seed,
         judged_gains={name: gains.gains_of(study(one).parts) for name, one in candidates.items()},
         lower_bounds={name: judging.rms_lower_bound(one, judged.held_out_seed) for name, one in candidates.items()},
-        broken_by=_find_broken_requirements(candidates, held_out, judged.held_out_seed),
+        broken_by=_find_broken_requirements(candidates, held_out, judged.held_out_seed, problem),
         shortest=shortest,
         trust=trust_checks,
         beyond=beyond_bounds,
@@ -211,8 +211,8 @@ def _search_and_judge(
         search_end, rounded = time.monotonic(), setup.rounded_gains(outcome.normalised)
         tuned = judging.on_flight_clock(gains.in_scenario(setup.ready.scenario, rounded))
         held_out_seed = judging.derive_held_out_seed(setup.settings.seed, len(earlier))
-        trials = judging.judge(tuned, held_out_seed)
-        verdicts = judging.verdicts_of(tuned, trials, held_out_seed)
+        trials = judging.judge(tuned, held_out_seed, setup.problem)
+        verdicts = judging.verdicts_of(tuned, trials, held_out_seed, setup.problem)
         broken_ratios = _broken_ratios(outcome, verdicts)
         if not broken_ratios or outcome.interrupted or len(earlier) + 1 >= tries:
             return _Judged(outcome, search_end, earlier, rounded, tuned, held_out_seed, trials, verdicts), setup
@@ -285,7 +285,7 @@ def _find_shortest_time(setup: TuningSetup, judged: _Judged) -> ShortestTime | N
 
 
 def _find_broken_requirements(
-    candidates: dict[str, Scenario], held_out: dict[str, Trials], seed: int
+    candidates: dict[str, Scenario], held_out: dict[str, Trials], seed: int, problem: Problem
 ) -> dict[str, list[str]]:
     """Return the gains that are more accurate than the tuned gains, and the metrics whose requirements they break.
 
@@ -295,6 +295,7 @@ def _find_broken_requirements(
         candidates: scenario of each set of gains, by name.
         held_out: held-out trials of each set of gains, by the same names; "tuned" are the tuned gains.
         seed: seed of these trials.
+        problem: the tuning problem of the search.
     """
 
     def more_accurate(trials: Trials) -> bool:
@@ -303,7 +304,11 @@ def _find_broken_requirements(
         return bool(other < tuned)
 
     return {
-        name: [verdict.metric for verdict in judging.verdicts_of(candidates[name], trials, seed) if not verdict.met]
+        name: [
+            verdict.metric
+            for verdict in judging.verdicts_of(candidates[name], trials, seed, problem)
+            if not verdict.met
+        ]
         for name, trials in held_out.items()
         if more_accurate(trials)
     }
@@ -366,12 +371,13 @@ def _results_beyond_bounds(judged: _Judged, at_bound: dict[str, str]) -> dict[st
             continue
         try:
             other = judging.on_flight_clock(gains.in_scenario(tuned, {**judged.gains, name: value}))
-            trials = judging.judge(other, judged.held_out_seed)
+            trials = judging.judge(other, judged.held_out_seed, judged.search.problem)
         except ScenarioError:  # no valid scenario beyond the bound
             continue
         both = trials.finished & judged.trials.finished
         error, tuned_error = (trust.rms(np.asarray(t.metrics.window_error)[both]) for t in (trials, judged.trials))
-        verdicts, failures = judging.verdicts_of(other, trials, judged.held_out_seed), int(np.count_nonzero(~trials.ok))
+        verdicts = judging.verdicts_of(other, trials, judged.held_out_seed, judged.search.problem)
+        failures = int(np.count_nonzero(~trials.ok))
         broken = next((str(verdict) for verdict in verdicts if not verdict.met), None)
         if broken is None and failures:
             broken = f"{failures} of {trials.status.size} held-out trials fail"
@@ -382,8 +388,9 @@ def _results_beyond_bounds(judged: _Judged, at_bound: dict[str, str]) -> dict[st
 
 
 def _compile_judging(scenario: Scenario) -> None:
-    """Start to compile the programs that judge gains, in the background."""
+    """Start to compile the programs that judge gains and that the search does not need, in the background."""
     simulated = study(judging.on_flight_clock(scenario))
-    montecarlo.prepare(simulated.parts, simulated.dispersion, judging.count_held_out_trials(simulated))
-    if scenario.sampled:
+    if not scenario.sampled:
+        montecarlo.prepare(simulated.parts, simulated.dispersion, judging.count_held_out_trials(simulated))
+    else:
         run_margins.judged_margins.prepare(simulated.parts, True)
