@@ -76,7 +76,7 @@ def medians(
 def steps(parts: Parts) -> int:
     """Return the number of control periods of a run, those of length zero included."""
     assert isinstance(parts.clock, Sampled)
-    return parts.clock.before + parts.clock.after
+    return parts.clock.count
 
 
 def step_operations(ready: Study) -> int:

@@ -43,12 +43,11 @@ def arcsec(v):
 # ## The pure function
 #
 # `ptsmc.study` turns a scenario into `parts`, a pytree. Every number of the scenario is a leaf. `ptsmc.simulate_parts`
-# maps parts, a seed and a trial number to a result with metrics. The number of samples is fixed when the parts are built,
-# so we state with `reach_of` that `delta` may become as large as 3 s.
+# maps parts, a seed and a trial number to a result with metrics.
 
 # %%
 flight = ptsmc.read("../scenarios/first_flight.toml")
-parts = ptsmc.study(flight, reach=ptsmc.reach_of(flight, delta=3.0)).parts
+parts = ptsmc.study(flight).parts
 print(ptsmc.gains_of(parts))
 
 # %% [markdown]

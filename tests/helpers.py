@@ -122,7 +122,7 @@ def untuned(text: str) -> dict[str, Any]:
 
 def roomy(timing: Any) -> Any:
     """Return the clock with more steps, or periods of length zero, so that runs with other times share one program."""
-    counts = {name: getattr(timing, name) for name in ("before", "after")}
+    counts = {name: getattr(timing, name) for name in (("count",) if timing.sampled else ("before", "after"))}
     more = {name: count if count > 1024 else 512 if count <= 512 else 1024 for name, count in counts.items()}
     return dataclasses.replace(timing, **more)
 
@@ -181,13 +181,9 @@ def parts(
     k1=1.0,
     surface_rate=1.0,
     saves: Any = (),
-    reach: tuple[float, float] | None = None,
     kinematics: Any = AdditiveKinematics,
 ) -> Parts:
-    """Return the parts of the published Case I with changes, in the continuous loop unless a period is given.
-
-    `reach` is the largest (t_f, delta) of the clock.
-    """
+    """Return the parts of the published Case I with changes, in the continuous loop unless a period is given."""
     body = rigid_body.spacecraft(inertia)
     t_end = t_f + 10.0 if t_end is None else t_end
     if period is None:
@@ -197,8 +193,7 @@ def parts(
     elif flight:
         timing = clock.flight_clock(period, t_end)
     else:
-        longest = reach or (t_f, delta)
-        timing = roomy(clock.anchored_clock(period, t_end, longest[0], t_end - t_f + longest[1]))
+        timing = roomy(clock.anchored_clock(period, t_end))
     return Parts(
         plant=body,
         disturbance=disturbance
@@ -253,7 +248,7 @@ def chain_parts(
     gains = tuple(vector(v) for v in (t_f, eta, delta, k1, sign_width, surface_rate))
     law = PrescribedTimeChain(ChainKinematics(model), *gains, a=vector(a))
     if period is not None:
-        timing: Any = roomy(clock.anchored_clock(period, t_end, t_f, 2.0 + delta))
+        timing: Any = roomy(clock.anchored_clock(period, t_end))
     elif steps is not None:
         largest = vector(1.5 * t_f / steps[0])
         timing = clock.Graded(vector(t_end), vector(1.0), largest, jnp.zeros(0), *steps)

@@ -46,8 +46,7 @@ class Reach:
 
     smallest_t_f: float  # smallest t_f [s]
     t_f: float  # largest t_f [s]
-    delta: float  # largest delta [s]
-    smallest_delta: float  # smallest delta [s]
+    smallest_delta: float  # smallest delta [s]; not used in the sampled loop
     gain: float  # smallest observer gain [N m s]; not used without an observer
     largest_gain: float  # largest observer gain [N m s]
     k1: float  # largest K1 [1/s]
@@ -58,7 +57,7 @@ class Reach:
 
 
 _INTERVALS = (  # fields of `Reach`: smallest and largest value
-    ("smallest_t_f", "t_f"), ("smallest_delta", "delta"), ("gain", "largest_gain"), ("smallest_period", "period")
+    ("smallest_t_f", "t_f"), ("gain", "largest_gain"), ("smallest_period", "period")
 )  # fmt: skip
 _POSITIVE_FIELDS = ("smallest_t_f", "t_f", "smallest_period", "period")  # divisors of clocks and steps
 
@@ -76,9 +75,9 @@ def reach_of(scenario: Scenario, **changes: float) -> Reach:
         TypeError: `scenario` is not a scenario.
 
     >>> from ptsmc_jax.scenario import from_tables
-    >>> reach = reach_of(from_tables({}), delta=2.0)
-    >>> reach.t_f, reach.smallest_delta, reach.delta
-    (30.0, 0.05, 2.0)
+    >>> reach = reach_of(from_tables({}), t_f=40.0)
+    >>> reach.smallest_t_f, reach.t_f, reach.smallest_delta
+    (30.0, 40.0, 0.05)
     """
     check_scenario(scenario)
     names = [field.name for field in dataclasses.fields(Reach)]
@@ -93,7 +92,7 @@ def reach_of(scenario: Scenario, **changes: float) -> Reach:
     gains, delta = getattr(scenario.observer, "gain", (0.0,)), scenario.hand_over
     k1, width, rate = getattr(law, "k1", 1.0), getattr(law, "sign_width", 0.0), getattr(law, "surface_rate", 1.0)
     period = scenario.loop.period
-    present = Reach(law.t_f, law.t_f, delta, delta, min(gains), max(gains), k1, width, rate, period, period)
+    present = Reach(law.t_f, law.t_f, delta, min(gains), max(gains), k1, width, rate, period, period)
     reach = dataclasses.replace(present, **changes)
     for low, high in _INTERVALS:
         if getattr(reach, low) > getattr(reach, high):
@@ -134,11 +133,8 @@ def choose_timing(
     substeps = _count_substeps(scenario, reach.period, frequencies)
     last_time = scenario.end + reach.t_f - scenario.controller.t_f
     _check_steps(scenario, last_time, reach.smallest_period, substeps)
-    if loop.clock == "flight":
-        run_clock = clock.flight_clock(reach.smallest_period, last_time)
-    else:
-        time_from_hand_over = scenario.end - scenario.controller.t_f + reach.delta
-        run_clock = clock.anchored_clock(reach.smallest_period, scenario.end, reach.t_f, time_from_hand_over)
+    build_clock = clock.flight_clock if loop.clock == "flight" else clock.anchored_clock
+    run_clock = build_clock(reach.smallest_period, last_time)
     return dataclasses.replace(run_clock, period=vector(loop.period), t_end=vector(scenario.end)), substeps
 
 

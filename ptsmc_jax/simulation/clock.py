@@ -38,43 +38,33 @@ def _full_intervals(t: Array, t_next: Array, hold: Array) -> Ticks:
 class Sampled:
     """Control clock of a sampled loop: an anchored clock, or the clock of a flight computer.
 
-    Anchored clock: sample k is at the hand-over plus (k - before) periods, so all samples and their noise move with the
-    hand-over. A run depends smoothly on delta and t_f. The first period, from t = 0, is partial. Its noise is blended
-    with the noise of the next sample, so that no state jumps when the partial period vanishes. At that point
-    derivatives by delta and t_f are one-sided, and the chattering jumps by the contribution of one sample.
+    Anchored clock: samples are whole periods before and after the hand-over, so all samples and their noise move with
+    it. A run depends smoothly on delta and t_f. The first period, from t = 0, is partial. Its noise is blended with the
+    noise of the next sample, so that no state jumps when the partial period vanishes. At that point derivatives by
+    delta and t_f are one-sided, and the chattering jumps by the contribution of one sample.
 
     Flight clock: sample k is at k periods from t = 0. The hand-over is the first sample at or after t_f - delta.
 
-    Clocks of both kinds with the same numbers of samples share compiled programs.
+    Clocks of both kinds with the same number of samples share compiled programs.
     """
 
     period: Leaf  # h [s]
     t_end: Leaf  # [s]
     anchored: Leaf  # 1: anchored clock; 0: flight clock
-    # number of samples before the hand-over of an anchored clock, at least (t_f - delta) / period
-    before: int = field(metadata={"static": True})
-    after: int = field(metadata={"static": True})  # number of further samples
+    count: int = field(metadata={"static": True})  # number of samples; an anchored clock needs t_end / period + 1
     sampled: ClassVar[bool] = True
 
-    @property
-    def count(self) -> int:
-        """The number of samples."""
-        return self.before + self.after
-
     def long_enough_for(self, clocks: Sequence["Sampled"]) -> "Sampled":
-        """Return this clock with as many samples before and after the hand-over as the longest of several clocks."""
-        return replace(self, before=max(clock.before for clock in clocks), after=max(clock.after for clock in clocks))
-
-    def sized_as(self, other: "Sampled") -> "Sampled":
-        """Return this flight clock with the numbers of samples of another clock, so that both share programs."""
-        return replace(self, before=other.before, after=other.after) if self.count <= other.count else self
+        """Return this clock with as many samples as the longest of several clocks."""
+        return replace(self, count=max(clock.count for clock in clocks))
 
     def ticks(self, t_f: Scalar, delta: Scalar) -> Ticks:
         """Control periods for this prescribed time and delta [s]."""
         is_anchored, tolerance = jnp.asarray(self.anchored) > 0.5, guards.time_tolerance(self.period, t_f)
-        numbers = jnp.arange(self.count + 1)
+        numbers = jnp.arange(self.count + 1, dtype=jnp.int32)
+        before = jnp.ceil(jax.lax.stop_gradient((t_f - delta) / self.period)).astype(jnp.int32)
         # one array of nodes, so that each interval ends exactly where the next begins
-        anchored_nodes = (t_f - delta) + (numbers - self.before).astype(float) * self.period
+        anchored_nodes = (t_f - delta) + (numbers - before).astype(float) * self.period
         nominal = jnp.where(is_anchored, anchored_nodes, numbers.astype(float) * self.period)
         # rounding may put the sample at t = 0 slightly after it; then there would be two samples
         has_started = ~is_anchored | (nominal > tolerance)
@@ -82,7 +72,7 @@ class Sampled:
             jnp.where(has_started, nominal, 0.0), self.t_end, guards.time_tolerance(self.period, self.t_end)
         )
         t, t_next = nodes[:-1], nodes[1:]
-        sample = jnp.arange(self.count, dtype=jnp.int32) - jnp.where(is_anchored, self.before, 0).astype(jnp.int32)
+        sample = numbers[:-1] - jnp.where(is_anchored, before, 0)
         # the start of a period decides, because rounding may make its length equal to a full period or longer
         partial = ~has_started[:-1]
         fraction = jnp.where(partial, (t_next - t) / self.period, 1.0)
@@ -163,15 +153,14 @@ class Graded:
         return (t_f - jnp.exp(u)).at[0].set(0.0).at[-1].set(t_f - delta)
 
 
-def anchored_clock(period: float, t_end: float, t_f_max: float, longest_after: float) -> Sampled:
-    """Return the anchored clock for t_f up to `t_f_max` and a hand-over at most `longest_after` before t_end, in s."""
-    before, after = math.ceil(t_f_max / period), math.ceil(longest_after / period) + 1
-    return Sampled(vector(period), vector(t_end), vector(1.0), before, after)
+def anchored_clock(period: float, t_end: float) -> Sampled:
+    """Return the anchored clock; period and t_end in s."""
+    return Sampled(vector(period), vector(t_end), vector(1.0), math.ceil(t_end / period) + 1)
 
 
 def flight_clock(period: float, t_end: float) -> Sampled:
-    """Return the flight clock; period and t_end in s."""
-    return Sampled(vector(period), vector(t_end), vector(0.0), 0, math.ceil(t_end / period))
+    """Return the flight clock; period and t_end in s. It has as many samples as the anchored clock."""
+    return replace(anchored_clock(period, t_end), anchored=vector(0.0))
 
 
 def graded_clock(

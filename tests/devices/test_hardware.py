@@ -310,7 +310,6 @@ def everything(delta=0.93, **changes):
         30.0,
         period=0.1,
         t_end=18.0,
-        reach=(15.0, 2.0),
         sign_width=0.05,
         inertia=FULL_INERTIA,
         **changes,

@@ -87,7 +87,7 @@ def simulate_rotation(law, angle, rate, t_end, period=0.005):
     law = replace(law, kinematics=MultiplicativeKinematics(body), t_f=vector(t_end - 1.0), delta=vector(period))
     run = helpers.parts(t_end - 1.0, 3.0, period, inertia=(10.0, 12.0, 14.0), q=q, rate=(0.0, 0.0, rate), period=period,
                         t_end=t_end, disturbance=disturbances.Constant(jnp.zeros(3)))  # fmt: skip
-    log = fly(replace(run, controller=law, clock=clock.anchored_clock(period, t_end, t_end - 1.0, 1.0 + period))).log
+    log = fly(replace(run, controller=law, clock=clock.anchored_clock(period, t_end))).log
     return log.t[log.has_length], log.error[log.has_length, 2]
 
 

@@ -332,13 +332,13 @@ def test_kinds_of_dispersion():
 @pytest.mark.parametrize("mode", ["anchored", "flight"])
 def test_the_clock_covers_the_reach_of_the_gains(mode):
     scenario = from_tables(tomllib.loads(SAMPLED + f"loop.clock = '{mode}'"))
-    parts = study(scenario, reach=reach_of(scenario, t_f=35.0, delta=4.0)).parts
+    parts = study(scenario, reach=reach_of(scenario, t_f=35.0)).parts
     for t_f, delta in ((30.0, 0.05), (30.0, 4.0)):
         ticks = ticks_of(parts.clock, vector(t_f), vector(delta))
         assert (float(ticks.t[0]), float(ticks.t_next[-1])) == (0.0, 40.0)
         assert float((ticks.t_next - ticks.t).max()) <= 0.05 * (1 + ROUNDING) + 40 * np.finfo(float).eps
-    with pytest.raises(ValueError, match="delta is -3, but must be a finite number of at least 0"):
-        reach_of(scenario, delta=-3)
+    with pytest.raises(ValueError, match="smallest_delta is -3, but must be a finite number of at least 0"):
+        reach_of(scenario, smallest_delta=-3)
 
 
 @pytest.mark.parametrize(
@@ -347,7 +347,7 @@ def test_the_clock_covers_the_reach_of_the_gains(mode):
         ({"smallest_t_f": 0.0}, "smallest_t_f is 0.0, but must be a finite number greater than 0"),
         ({"smallest_period": 0}, "smallest_period is 0, but must be a finite number greater than 0"),
         ({"t_f": 20.0}, "smallest_t_f is 30, but must be at most t_f, 20"),
-        ({"smallest_delta": 1e9}, "smallest_delta is 1e+09, but must be at most delta, 0.05"),
+        ({"smallest_period": 1e9}, "smallest_period is 1e+09, but must be at most period, 0.05"),
     ],
     ids=str,
 )

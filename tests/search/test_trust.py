@@ -26,7 +26,7 @@ BOUNDS = Bounds(("eta", "delta", "t_f"), (2.5, 0.3, 15.0), (5.0, 4.0, 25.0))
 def moved_in_time(**limits):
     """Return a double integrator with noise. Its clock covers all of `BOUNDS`, so that tests share one program."""
     noisy = problem(**limits)
-    far = replace(noisy.parts, clock=clock.anchored_clock(0.2, 21.0, 25.0, 5.0))
+    far = replace(noisy.parts, clock=clock.anchored_clock(0.2, 21.0))
     return replace(noisy, parts=far, names=BOUNDS.names)
 
 
@@ -185,7 +185,7 @@ def test_equal_or_too_few_values_have_no_interval():
 def test_differential_evolution_finds_the_same_optimum(monkeypatch):
     monkeypatch.setattr(global_check, "GENERATIONS", 30)
     run = parts(20.0, 3.0, 0.5, period=0.2, noise=(2e-5, 1e-6), t_end=21.0)
-    run = replace(run, clock=clock.anchored_clock(0.2, 21.0, 20.0, 5.0))
+    run = replace(run, clock=clock.anchored_clock(0.2, 21.0))
     nothing = variation.Dispersion()
     some = objective.problem(run, nothing, 3, np.arange(4), ("eta", "delta"), [Requirement("peak_torque", 0.6)])
     evaluate = Evaluator(Bounds(("eta", "delta"), (2.05, 0.2), (6.0, 5.0)))

@@ -55,9 +55,9 @@ def loss(request):
         model, wave = integrator_chain.chain(2), disturbances.Sinusoid(*(vector([v]) for v in (0.01, 0.1, 0.0, 0.0)))
         observer = nonlinear.NonlinearObserver(model, vector([10.0]), vector(1e-3), vector(0.0))
         run = chain_parts([1.0, 0.0], noise=[2e-5, 1e-6], disturbance=wave, observer=observer)
-        run = replace(run, clock=clock.anchored_clock(0.1, 23.0, 23.0, 6.0), t_end=vector(23.0))
+        run = replace(run, clock=clock.anchored_clock(0.1, 23.0), t_end=vector(23.0))
     else:
-        run = parts(20.0, 3.0, 0.5, period=0.1, noise=(2e-5, 1e-6), t_end=23.0, reach=(23.0, 3.0))
+        run = parts(20.0, 3.0, 0.5, period=0.1, noise=(2e-5, 1e-6), t_end=23.0)
     drawn = {"chain": SPREAD, "spacecraft": TURNED}[request.param]
 
     def value(at):
@@ -186,7 +186,7 @@ def problem(count=8, dispersion=SPREAD, may_break=None, **limits):
         run = chain_parts([25.0, 0.0], 20.0, 3.0, 0.5, period=0.2, noise=[5e-4, 2.5e-5])
     else:
         run = parts(20.0, 3.0, 0.5, period=0.2, noise=(2e-5, 1e-6), t_end=21.0)
-    run = replace(run, clock=clock.anchored_clock(0.2, 21.0, 20.0, 5.0), t_end=vector(21.0))
+    run = replace(run, clock=clock.anchored_clock(0.2, 21.0), t_end=vector(21.0))
     wanted = [Requirement(metric, limit) for metric, limit in (FAR_OFF | limits).items()]
     may_break = None if may_break is None else (may_break, None, None)
     return objective.problem(run, dispersion, 3, np.arange(count), WITHIN.names, wanted, may_break)
@@ -547,7 +547,7 @@ def test_shortest_t_f_for_a_torque_limit_agrees_with_theory(plant, monkeypatch):
         q = [0.0, 0.0, np.sin(theta / 2), np.cos(theta / 2)]
         run = parts(20.0, eta, 1.0, q=q, period=0.2, t_end=21.0, disturbance=disturbances.Constant(jnp.zeros(3)))
         moved = 2 * 14.0 * np.tan(theta / 2)
-    run = replace(run, clock=clock.anchored_clock(0.2, 21.0, 40.0, 5.0), t_end=vector(21.0))
+    run = replace(run, clock=clock.anchored_clock(0.2, 21.0), t_end=vector(21.0))
     wanted = [Requirement("peak_torque", limit)]
     some = objective.problem(run, variation.Dispersion(), 3, np.arange(1), ("t_f", "delta"), wanted, objective="t_f")
     evaluate = Evaluator(normalisation.Bounds(("t_f", "delta"), (8.0, 0.4), (40.0, 4.0)))

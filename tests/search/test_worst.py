@@ -31,7 +31,7 @@ def posed(dispersion, requirement=None, settling_angle=4.0, **others):
     start.
     """
     run = parts(T_F, ETA, 1.0, period=0.2, t_end=21.0, disturbance=sine(0.0), **others)
-    run = replace(run, clock=clock.anchored_clock(0.2, 21.0, T_F, 5.0), settling_angle=vector(settling_angle))
+    run = replace(run, clock=clock.anchored_clock(0.2, 21.0), settling_angle=vector(settling_angle))
     asked = requirement or Requirement("peak_torque", LIMIT)
     wanted = [asked if asked.metric == name else Requirement(name, limit) for name, limit in FAR.items()]
     wanted += [asked] if asked.metric not in FAR else []
@@ -126,7 +126,7 @@ def swinging(x0, std, amplitude, settling_angle=1e9, **limits):
     """
     acting = disturbances.Sinusoid(*(vector([v]) for v in (amplitude, 0.1, 0.0, 0.0)))
     run = chain_parts([x0, 0.0], T_F, ETA, 1.0, period=0.2, disturbance=acting)
-    run = replace(run, clock=clock.anchored_clock(0.2, 21.0, T_F, 5.0), t_end=vector(21.0))
+    run = replace(run, clock=clock.anchored_clock(0.2, 21.0), t_end=vector(21.0))
     run = replace(run, settling_angle=vector(settling_angle))
     spread = variation.Dispersion({
         "initial_state": RandomNumbers("normal", vector(std)),
@@ -319,7 +319,7 @@ def test_the_hardest_screened_trial_is_the_worst_case_if_nothing_can_be_moved():
     )
     assert simulations.differentiable_dispersions(spread) == ("initial_attitude",)
     run = chain_parts([1.0, 0.0], T_F, ETA, 1.0, period=0.2, noise=[1e-2, 1e-3])
-    run = replace(run, clock=clock.anchored_clock(0.2, 21.0, T_F, 5.0), t_end=vector(21.0))
+    run = replace(run, clock=clock.anchored_clock(0.2, 21.0), t_end=vector(21.0))
     wanted = [Requirement("peak_rate", 0.1)]
     problem = objective.problem(run, variation.Dispersion(), 5, np.arange(8), ("eta", "delta"), wanted)
     at = np.array([ETA, 1.0])

@@ -157,7 +157,7 @@ REFUSED = [
     (lambda: API.with_gains(RUN, {"eta": 3j}), "eta is 3j, but must be a number"),
     (lambda: API.with_gains(RUN, {"eta": jnp.nan}), "eta is nan, but must be a finite number"),
     (lambda: API.chain(True), "order is True, but must be a whole number of at least 2"),
-    (lambda: API.reach_of(FLIGHT, dlta=2.0), "there is no dlta in a reach; allowed are smallest_t_f, t_f, delta"),
+    (lambda: API.reach_of(FLIGHT, dlta=2.0), "there is no dlta in a reach; allowed are smallest_t_f, t_f, small"),
     (lambda: jax.eval_shape(lambda seed: draws.stream(seed, 0, "noise"), 0.5), "of type float64, but must be a whole"),
     (lambda: jax.eval_shape(lambda trial: draws.stream(0, trial, "noise"), jnp.arange(2)),
      r"a seed or trial is of shape \(2,\), but must be one number; use jax.vmap for several"),
@@ -218,7 +218,7 @@ def test_parts_and_results_print_short_lines():
     assert re.search(r"    window_error +ShapeDtypeStruct\(shape=\(\), dtype=float64\)\n", repr(shapes))
     assert "  metrics:\n    terminal_error " in repr(shapes)
     log = jax.tree.map(lambda v: np.zeros(v.shape, v.dtype), shapes.log)
-    assert {"  u: float64 (181, 3)", "    q: float64 (181, 4)"} <= set(repr(log).splitlines())
+    assert {"  u: float64 (182, 3)", "    q: float64 (182, 4)"} <= set(repr(log).splitlines())
     jax.jit(lambda run: repr(run) and run.t_end)(RUN)
     given = replace(RUN, t_end=RUN.t_end + 0.0, window=jax.random.key(0))
     given.t_end.delete()  # like a donated argument

@@ -239,7 +239,7 @@ def test_metrics_of_many_runs_survive_jax_transformations():
 @pytest.mark.parametrize("flight", [False, True])
 def test_the_last_row_holds_the_torque_of_the_last_period(flight):
     """Periods of length zero beyond t_end, and the period before t = 0, have no effect."""
-    body = parts(20.0, 3.0, 0.53, period=0.05, noise=(2e-4, 1e-5), reach=(25.0, 2.0))
+    body = parts(20.0, 3.0, 0.53, period=0.05, noise=(2e-4, 1e-5))
     run = chain_flight() if flight else body  # with the compiled programs of other tests
     log = fly(run, 1, 4).log
     rows = np.flatnonzero(np.asarray(log.has_length))

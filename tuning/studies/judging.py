@@ -88,7 +88,7 @@ def _on_flight_clock(scenario: Scenario, problem: Problem | None, reach: Reach |
     if problem is None or not scenario.sampled:
         return simulated
     parts = simulated.parts
-    parts = dataclasses.replace(parts, clock=parts.clock.sized_as(problem.parts.clock))
+    parts = dataclasses.replace(parts, clock=parts.clock.long_enough_for([parts.clock, problem.parts.clock]))
     return dataclasses.replace(simulated, parts=parts)
 
 

@@ -144,15 +144,13 @@ def tuning_reach(scenario: Scenario, **overrides: float) -> Reach:
         low, high = scenario.search.bounds.get(name, (value, value))
         return min(low, value), max(high, value if largest is None else largest)
 
-    smallest_delta, delta = covering_range("delta", scenario_reach.delta)
     smallest_t_f, t_f = covering_range("t_f", scenario_reach.t_f)
     gain, largest_gain = covering_range("observer_gain", scenario_reach.gain, scenario_reach.largest_gain)
     covered = dataclasses.replace(
         scenario_reach,
         smallest_t_f=smallest_t_f,
         t_f=t_f,
-        delta=delta,
-        smallest_delta=smallest_delta,
+        smallest_delta=covering_range("delta", scenario_reach.smallest_delta)[0],
         gain=gain,
         largest_gain=largest_gain,
         k1=covering_range("k1", scenario_reach.k1)[1],
