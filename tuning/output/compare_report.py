@@ -64,23 +64,25 @@ def _error_column(name: str, change: str) -> Value:
     )
 
 
-def _margin_column(name: str) -> Value:
-    """Return the column of a margin in the hold phase.
+def _margin_columns(name: str) -> tuple[Value, Value]:
+    """Return two columns of a margin: the worst over all loops if the margin is required, and of the nominal loop."""
 
-    The margin is the worst of the dispersed loops if it is required, otherwise the margin of the nominal loop.
-    """
-
-    def read_margin_of_law(law: Law) -> Number:
-        """Return the law's margin called `name`. It is infinite if unlimited, and None if it was not computed."""
+    def read_worst(law: Law) -> Number:
+        """Return the worst margin over the dispersed loops, infinite if unlimited; None if it is not required."""
         verdict = next((entry for entry in law.verdicts if entry.metric == name), None)
-        if verdict is not None:
-            return math.inf if verdict.worst is None and not verdict.failures else verdict.worst
+        if verdict is None:
+            return None
+        return math.inf if verdict.worst is None and not verdict.failures else verdict.worst
+
+    def read_nominal(law: Law) -> Number:
+        """Return the margin of the nominal loop, infinite if unlimited; None if it was not computed."""
         if law.margins is None or "hold" not in law.margins:
             return None
         margin = law.margins["hold"][name]
         return math.inf if margin is None else margin  # null means that the margin is unlimited
 
-    return Value(name.removesuffix("_margin").replace("_", " "), MARGINS[name].unit, read_margin_of_law)
+    label, unit = name.removesuffix("_margin").replace("_", " "), MARGINS[name].unit
+    return Value(f"{label}, worst loop", unit, read_worst), Value(f"{label}, nominal loop", unit, read_nominal)
 
 
 ERROR = Value(
@@ -126,13 +128,14 @@ QUESTIONS = (
     ),
     Question(
         "What margins are left?",
-        tuple(_margin_column(name) for name in MARGINS),
-        1,
+        tuple(column for name in MARGINS for column in _margin_columns(name)),
+        2,
         logarithmic=False,
+        axis_label="gain margin",
         limit="gain_margin",
-        note="Margins of the nominal loop in the hold phase, at its worst input. A required margin is the worst of the "
-        "dispersed loops, in the hold phase and the analysed part of the approach phase. Below 0 the loop is unstable. "
-        "The chart shows the gain margin.",
+        note="The nominal loop is analysed in the hold phase, at its worst input. The worst loop is the worst of the "
+        "dispersed loops, in the hold phase and the analysed part of the approach phase; it is known for required "
+        "margins only. Below 0 the loop is unstable. The chart shows the gain margin.",
     ),
     Question(
         "What if the model is wrong?",
@@ -180,12 +183,13 @@ def charts(laws: dict[str, Law]) -> dict[str, list[Block]]:
     names, charts_by_title = [_readable_name(law) for law in laws], dict[str, list[Block]]()
     for number, question in enumerate(QUESTIONS):
         if _has_answer(question, laws):
-            shown = question.values[: question.drawn]
+            drawn = question.values[: question.drawn]
+            shown = [value for value in drawn if any(value.read(law) is not None for law in laws.values())]
             series = {
                 value.name: ([value.read(law) for law in laws.values()], [value.interval(law) for law in laws.values()])
                 for value in shown
             }
-            axis = f"{question.axis_label or shown[0].name} [{shown[0].unit}]"
+            axis = f"{question.axis_label or drawn[0].name} [{drawn[0].unit}]"
             marks = reference_lines(question, list(laws.values()))
             figure = page_charts.laws(names, series, axis, marks, question.logarithmic)
             charts_by_title[question.title] = [Chart(f"question_{number}", figure, question.note)]

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from scipy import stats
 
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.campaigns.montecarlo import Trials
@@ -283,13 +282,12 @@ def contender_results(contender: Contender) -> dict[str, object]:
     Statistics use the trials that reached their end. The counts and the quantiles of the settling time use all trials.
     """
     trials = contender.trials
-    rank_correlation: Any = stats.spearmanr
     initial_angle, finished = trials.drawn["initial_angle"], trials.finished
     error, interval = judging.rms_window_error(trials)
     settling = np.asarray(trials.metrics.settling_time)
     settled = finished & np.isfinite(settling)
     times, times_or_never = settling[settled], np.where(settled, settling, np.inf)  # infinite: the trial never settles
-    can_correlate = times.size > 2 and has_variation(initial_angle[settled]) and has_variation(times)
+    depends_on_angle = times.size > 2 and has_variation(initial_angle[settled]) and has_variation(times)
     mean = {name: float(np.mean(getattr(trials.metrics, name)[finished])) if finished.any() else None
             for name in ("peak_torque", "effort", "chattering")}  # fmt: skip
     return {
@@ -305,9 +303,7 @@ def contender_results(contender: Contender) -> dict[str, object]:
         "largest_peak_torque": _largest_peak(trials),
         "unsettled": int(trials.status.size - times.size),
         "settling_time": {str(q): _quantile(times_or_never, q) for q in (0.01, 0.5, 0.99)},
-        # dependence of the settling time on the initial angle: rank correlation, and medians at small and large angles
-        "settling_by_angle": float(rank_correlation(initial_angle[settled], times)[0]) if can_correlate else None,
-        "settling_near_far": _median_settling_times(initial_angle, times_or_never) if can_correlate else None,
+        "settling_near_far": _median_settling_times(initial_angle, times_or_never) if depends_on_angle else None,
         "margins": contender.margins,
         "model_errors": {name: _perturbed_results(other) for name, other in contender.changed.items()},
         "verdicts": [verdict.in_summary() for verdict in contender.verdicts],
@@ -388,16 +384,15 @@ def write(
         style.save(dict(_plot_figures(comparison)), folder / "figures")
 
 
-_QUANTILES = ("0.01", "0.5", "0.99")
-_COLUMNS = ("met", "window_error", "peak_torque", "largest_peak_torque", "effort", "chattering", "unsettled",
-            "settling_by_angle")  # fmt: skip
+_COLUMNS = ("window_error", "peak_torque", "largest_peak_torque", "effort", "chattering", "unsettled")
 
 
 def _csv_table(scenario: Scenario, content: Mapping[str, Any]) -> tuple[list[str], list[list[object]]]:
     """Return the header and the rows of `compare.csv`, one row for each law."""
     required = [name for name in catalogues.MARGINS if name in scenario.requirements]
-    nominal = [name for name in catalogues.MARGINS if name not in required]  # columns of the nominal loop in hold
-    header = ["law", *_COLUMNS, *(f"settling_time_{100 * float(q):g}" for q in _QUANTILES), *required, *nominal,
+    settling = ("settling_median", "settling_nearest_fifth", "settling_farthest_fifth")
+    margins = *(f"worst_{name}" for name in required), *(f"nominal_{name}" for name in catalogues.MARGINS)
+    header = ["law", "met", *_COLUMNS, *settling, *margins,
             "window_error_low", "window_error_high", *(f"window_error_{name}" for name in MODEL_ERRORS),
             "gains"]  # fmt: skip
 
@@ -405,8 +400,10 @@ def _csv_table(scenario: Scenario, content: Mapping[str, Any]) -> tuple[list[str
         worst = {v["metric"]: v["worst"] for v in figures["verdicts"]}
         hold = (figures["margins"] or {}).get("hold", {})
         return [
-            law, *(figures[name] for name in _COLUMNS), *((figures["settling_time"] or {}).get(q) for q in _QUANTILES),
-            *map(worst.get, required), *map(hold.get, nominal), *(figures["window_error_interval"] or (None, None)),
+            law, int(figures["met"]), *(figures[name] for name in _COLUMNS),
+            figures["settling_time"]["0.5"], *(figures["settling_near_far"] or (None, None)),
+            *map(worst.get, required), *map(hold.get, catalogues.MARGINS),
+            *(figures["window_error_interval"] or (None, None)),
             *(figures["model_errors"].get(name, {}).get("window_error") for name in MODEL_ERRORS),
             "; ".join(f"{name} = {value:.6g}" for name, value in figures["gains"].items()),
         ]  # fmt: skip
