@@ -34,14 +34,24 @@ ASSUMED_ERROR = {"gain_margin": 0.06, "phase_margin": 0.12, "delay_margin": 0.2,
 NOT_INTERPOLATED = (0.0, margins.LARGEST_MARGIN, -margins.LARGEST_MARGIN, 180.0, -180.0)
 
 
-def judge_loop(parts: Parts, required: Sequence[Requirement]) -> list[Verdict]:
+def judge_loop(parts: Parts, required: Sequence[Requirement], *, finished: bool = True) -> list[Verdict]:
     """Return the verdict on each required margin of the loop of these parts, see `run_margins.judge_run`.
 
-    There are no margins if the nominal run does not come to rest, see `limit_cycles`.
+    There are no margins if the nominal run does not come to rest, see `limit_cycles`. A loop that is open in the hold
+    phase has no margins either.
+
+    Args:
+        parts: the sampled parts.
+        required: the requirements on margins.
+        finished: whether the run of these parts reached its end. Otherwise no requirement is met.
     """
     if not required:
         return []
-    return _verdicts(required, run_margins.judge_run(parts, with_delay=_with_delay(required))[0].worst())
+    if finished:
+        values, hold, _ = run_margins.judge_run(parts, with_delay=_with_delay(required))
+        if not (values.is_open & hold[:, None]).any():
+            return _verdicts(required, values.worst())
+    return _verdicts(required, {requirement.metric: np.nan for requirement in required})
 
 
 def judge_trials(ready: Study, seed: int, rows: np.ndarray | Row | None = None) -> list[Verdict]:
@@ -109,7 +119,9 @@ def worst_margins(
     limits: Mapping[str, float],
     places: int = 1,
 ) -> dict[str, np.ndarray]:
-    """Return the worst margins of each trial over its axes and times, (trials,), by name; NaN without derivatives.
+    """Return the worst margins of each trial over its axes and times, (trials,), by name.
+
+    A trial has NaN if its loop is open in the hold phase, or has no finite derivatives.
 
     The worst value of each margin is exact, and so are the margins of the `places` trials nearest to a limit. The other
     margins are interpolated: they are farther from their limits, and on the right side, as far as the error is known.
@@ -188,11 +200,15 @@ def _loops_and_margins(
 ) -> tuple[linear.Loop, dict[str, Array]]:
     """Return the loops of each trial, (trials, times, ..), and their interpolated margins, the worst over the axes.
 
+    A loop that is open in the hold phase has NaN.
+
     with_delay: the loops allow delays by a fraction of a period, see `linear.linearise_period`.
     """
 
-    def interpolate_margins(loop: linear.Loop) -> dict[str, Array]:
-        return {name: _worst_value(name, v) for name, v in margins.estimate(loop).items()}
+    def interpolate_margins(loop: linear.Loop) -> tuple[dict[str, Array], Array]:
+        values = margins.estimate(loop)
+        is_open = (values["gain_margin"] == jnp.inf) & (jnp.abs(values["peak_sensitivity"]) < 1e-9)
+        return {name: _worst_value(name, v) for name, v in values.items()}, jnp.any(is_open)
 
     def simulate_trial(trial: Array | Row) -> tuple[Parts, linear.NominalRun]:
         drawn = trial_setup(parts, dispersion, seed, trial).dispersed_parts
@@ -203,8 +219,10 @@ def _loops_and_margins(
 
     def analyse_trials(trials: Array | Row) -> tuple[linear.Loop, dict[str, Array]]:
         loops = lapack.vmap(loops_of_trial)(*lanes.vmap(simulate_trial)(trials))
-        values = jax.lax.map(interpolate_margins, jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), loops))
-        return loops, {name: v.reshape(LOOPS_PER_CALL, -1) for name, v in values.items()}
+        by_loop = jax.lax.map(interpolate_margins, jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), loops))
+        values, is_open = jax.tree.map(lambda v: v.reshape(LOOPS_PER_CALL, -1), by_loop)
+        is_open = is_open.at[:, :-1].set(False)  # the last loop of a trial is in the hold phase
+        return loops, {name: jnp.where(is_open, jnp.nan, v) for name, v in values.items()}
 
     def analyse_on_device(trials: Array | Row) -> tuple[linear.Loop, dict[str, Array]]:
         calls = jax.lax.map(analyse_trials, jax.tree.map(lambda v: v.reshape(-1, LOOPS_PER_CALL, *v.shape[1:]), trials))

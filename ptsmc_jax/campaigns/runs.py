@@ -148,7 +148,7 @@ def simulate(
     finished = np.asarray(int(result.status) in rollout.FINISHED)
     verdicts = requirements.verdicts(ready.requirements, metrics.__getitem__, finished)
     if with_margins:
-        verdicts += margin_verdicts.judge_loop(parts, ready.margins)
+        verdicts += margin_verdicts.judge_loop(parts, ready.margins, finished=bool(finished))
     samples = {name: int(count) for name, count in result.samples.items()}
     bad_time, drawn = float(result.bad_time), {name: float(value) for name, value in drawn.items()}
     return Run(parts, log, metrics, ready.catalogue, status, reason, bad_time, verdicts, samples, drawn)

@@ -165,6 +165,7 @@ class Verdict:
             result = "unlimited"  # an infinite margin, which JSON cannot store
         elif math.isnan(worst):
             result = "no value" if trials == 1 else "no worst value"
+            result += ", as the run failed or the loop is open or not differentiable" if noun == "loops" else ""
         else:
             loop_count = f"of {trials} dispersed loops " if noun == "loops" else ""
             result = (f"worst {loop_count}" if trials > 1 else "") + quantity(worst, self.unit, 4, self.metric)

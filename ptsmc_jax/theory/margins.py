@@ -69,6 +69,18 @@ class Margins(NamedTuple):
             "peak_sensitivity": xp.where(self.stable, self.peak_sensitivity, LARGEST_MARGIN),
         }
 
+    @property
+    def is_open(self) -> Any:
+        """Whether the loop transfer L is zero at each input, bool.
+
+        For example, a torque limit saturates the command of the nominal run, or the law does not react to the state at
+        this sample.
+        """
+        # infinite margins, or the largest reported distance from a stability limit if other axes make the loop unstable
+        gain_up, gain_down, peak_sensitivity = map(abs, (self.gain_up, self.gain_down, self.peak_sensitivity))
+        unlimited = (gain_up >= LARGEST_MARGIN) & (gain_down >= LARGEST_MARGIN)
+        return unlimited & (peak_sensitivity < 1e-9) & (self.crossover != self.crossover)  # NaN: no crossover
+
 
 FIELDS = Margins._fields[:5]  # fields of `Margins` that are margins
 

@@ -177,7 +177,7 @@ CHAIN = {
     "plant": {"kind": "chain", "x0": [1.0, 0.0]},
     "disturbance": {"amplitude": [0.01], "frequency": [1.0]},
     "observer": {"kind": "nonlinear", "gain": [40.0]},
-    "hardware": {"state_noise": [2e-5, 1e-6], "torque_lag": 0.03},
+    "hardware": {"state_noise": [2e-5, 1e-6], "torque_lag": 0.03, "torque_limit": 50.0},
 }
 # no trial is nominal; a loop also depends on the initial state, because it is linearised along the run
 DRAWN = {
@@ -239,6 +239,21 @@ def test_margin_constraints_agree_with_verdicts_and_finite_differences(drawn):
     assert [v.worst for v in told] == [v.worst for v in verdicts]  # loops of the same trials
     tight = dataclasses.replace(asked, limits=asked.limits * 0.9)
     np.testing.assert_allclose(sloped(tight, bounds, normalised)["c"] + 1, (found["c"] + 1) / 0.9, rtol=1e-12)
+
+
+def test_loops_that_a_torque_limit_opens_in_the_hold_phase_have_no_margins():
+    """Earlier, their margins counted as unlimited, and every requirement on them was met."""
+    posed = posed_of("chain")
+    asked, bounds = posed.problem.margins, posed.evaluate.bounds
+    assert asked is not None
+    weak = dataclasses.replace(
+        asked.parts.actuators, torque_limit=np.full_like(asked.parts.actuators.torque_limit, 1e-3)
+    )
+    parts = dataclasses.replace(asked.parts, actuators=weak)
+    verdicts = margin_verdicts.judge_trials(dataclasses.replace(posed.ready, parts=parts), 3)
+    assert [(verdict.failures, verdict.trials, verdict.met) for verdict in verdicts] == [(TRIALS, TRIALS, False)] * 2
+    found = sloped(dataclasses.replace(asked, parts=parts), bounds, bounds.normalise(posed.scenario_gains))
+    assert np.all(found["c"].max(axis=1) >= 1.0)
 
 
 @pytest.mark.long

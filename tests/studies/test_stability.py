@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import scenario
+from ptsmc_jax import explore, scenario
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.theory import limit_cycles, margins, run_margins
 from tests.helpers import SHORT, SHORT_CHAIN, refused, short, untuned
@@ -249,6 +249,17 @@ def test_saturated_command_is_reported_as_an_open_loop():
     found = stability.summary(ready, course._replace(at_input=course.at_input._replace(**lost)))
     assert found["open"] == ["u1"]
     assert str(found["hold"]["u1"]["peak_sensitivity"]) == "0.0"  # not -0.0
+
+
+def test_simulate_does_not_meet_a_required_margin_of_an_open_loop_or_a_failed_run():
+    """Earlier, the margins of an open loop counted as unlimited, and those of a failed run as the linearised ones."""
+    disturbance = {"amplitude": [1e300], "frequency": [1.0]}  # the linearised loop has no disturbance
+    failing = limited_to(50.0), {"disturbance": disturbance}
+    for (base, changes), status in (((limited_to(0.02), {}), "not_converged"), (failing, "diverged")):
+        run = explore.simulate(scenario.replace(base, requirements={"gain_margin": 0.1}, **changes)).run
+        (verdict,) = run.verdicts
+        assert (run.status, verdict.met) == (status, False)
+        assert str(verdict).startswith("gain_margin at least 0.1 dB: no value, as the run failed or the loop is open")
 
 
 def blamed_on_no_limit(found, first, limited):

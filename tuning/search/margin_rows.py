@@ -30,7 +30,7 @@ from tuning.search.gains import with_gains
 from tuning.search.normalisation import Bounds, Scale
 
 CASES = 1  # number of random trials whose loops are constrained: the trials with the worst margins
-RATIO_OF_NAN = 2.0  # violation ratio of a loop without finite derivatives, as for a margin of zero
+RATIO_OF_NAN = 2.0  # violation ratio of a loop without margins, as for a margin of zero
 
 
 @pytree
@@ -112,8 +112,8 @@ def margin_constraints(
 ) -> Float[Array, "margins entries"]:
     """Return the constraints c of the margins, which are met if c <= 0.
 
-    c is the violation ratio of a margin, see `violation_ratio`, divided by `limits`, minus 1. A loop without finite
-    derivatives counts as a loop with a margin of zero.
+    c is the violation ratio of a margin, see `violation_ratio`, divided by `limits`, minus 1. A loop that has no finite
+    derivatives, or is open in the hold phase, counts as a loop with a margin of zero.
 
     Args:
         asked: the required margins.
@@ -130,12 +130,15 @@ def margin_constraints(
 
     loops_by_case = _map_cases(asked, gains, loops_of, runs)
     loops = jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), loops_by_case)
-    values = margins.compute_each(loops, with_delay=with_delay).by_name()
+    by_loop = margins.compute_each(loops, with_delay=with_delay)
+    values, times = by_loop.by_name(), loops_by_case.period.shape[1]
+    in_hold = jnp.arange(by_loop.phase.shape[0]) % times == times - 1
+    has_no_margin = (by_loop.is_open & in_hold[:, None]).reshape(-1)
     ratios = [
         violation_ratio(values[name].reshape(-1), limit, at_least=MARGINS[name].at_least)
         for name, limit in zip(asked.metrics, asked.required, strict=True)
     ]
-    finite_ratios = jnp.stack([jnp.where(jnp.isnan(ratio), RATIO_OF_NAN, ratio) for ratio in ratios])
+    finite_ratios = jnp.stack([jnp.where(has_no_margin | jnp.isnan(ratio), RATIO_OF_NAN, ratio) for ratio in ratios])
     return finite_ratios / asked.limits[:, None] - 1.0
 
 

@@ -18,7 +18,6 @@ from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.catalogues import CATALOGUES, NO_SIGN
 from ptsmc_jax.theory import margins, run_margins
-from ptsmc_jax.theory.crossings import LARGEST_MARGIN
 from ptsmc_jax.theory.limit_cycles import LimitCycle
 from ptsmc_jax.theory.margins import FIELDS
 from ptsmc_jax.theory.run_margins import Course
@@ -109,7 +108,7 @@ def summary(ready: Study, course: Course) -> dict[str, Any]:
     def open_inputs(k: int) -> dict[str, list[str]]:
         """Return the inputs with an open loop at sample k, and those of them that an actuator limit opens."""
         loop_margins, new = jax.tree.map(lambda v: v[k], (course.at_input, course.loops.new))
-        is_open = _is_open(loop_margins)
+        is_open = loop_margins.is_open
         has_no_effect = is_open & ~np.any(new[0], axis=0)  # no state depends on the command: an actuator limit cuts it
         return {key: [name for name, selected in zip(inputs, masks, strict=True) if selected]
                 for key, masks in (("open", is_open), ("cut", has_no_effect))}  # fmt: skip
@@ -141,17 +140,6 @@ def summary(ready: Study, course: Course) -> dict[str, Any]:
         **_initial_angle_entry(ready),
         **({} if course.limit_cycle is None else _limit_cycle_entry(ready.scenario, course.limit_cycle)),
     }
-
-
-def _is_open(loop_margins: margins.Margins) -> np.ndarray:
-    """Return whether the loop transfer L is zero at each input, (m,).
-
-    For example, a torque limit saturates the command of the nominal run, or the law does not react to the state at this
-    sample.
-    """
-    # infinite margins, or the largest reported distance from a stability limit if other axes make the loop unstable
-    unlimited = (np.abs(loop_margins.gain_up) >= LARGEST_MARGIN) & (np.abs(loop_margins.gain_down) >= LARGEST_MARGIN)
-    return unlimited & (np.abs(loop_margins.peak_sensitivity) < 1e-9) & np.isnan(loop_margins.crossover)
 
 
 def _initial_angle_entry(ready: Study) -> dict[str, float]:
