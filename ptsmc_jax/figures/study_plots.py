@@ -35,6 +35,7 @@ MARKERS = ("o", "^", "s", "D", "v")
 BEYOND = ("x", "+", "1", "2", "3", "4")  # markers of points that violate a limit, one for each limit
 # marker of a pair with a failed trial, visible on any colour
 FAILED: Any = {"marker": "X", "color": "white", "mec": "black", "mew": 0.6, "ms": 6}
+TORQUE_LIMIT = STYLES[1][0]  # colour of the required torque; grey as of `LIMIT` is a colour of the map
 NO_NUMBER = "0.9"  # grey of pairs without a number, which is not a colour of the map
 WIDEST = 1e4  # largest ratio of the values that the colours of a map span
 
@@ -352,6 +353,7 @@ def accuracy_map(
     failed: np.ndarray,
     limit_lines: Mapping[str, tuple[np.ndarray, np.ndarray]],
     kind: str = "spacecraft",
+    torque_limit: float | None = None,
 ) -> Figure:
     """Plot simulated window error, window error by linear theory, and peak torques over two keys.
 
@@ -362,6 +364,7 @@ def accuracy_map(
         failed: (y, x) bool, a trial failed or did not converge at t_f.
         limit_lines: lines (x, y) by label.
         kind: kind of the plant, which determines the units.
+        torque_limit: required limit of the largest peak torque; None: no line.
     """
     (convert, error, error_unit), unit = error_display(kind), CATALOGUES[kind]["peak_torque"].unit
     grids = {name: convert(grid) if "error" in name else grid for name, grid in grids.items()}
@@ -376,6 +379,8 @@ def accuracy_map(
     figure = Figure(figsize=(10.0, 4.2 * rows), layout="constrained")
     panels = np.atleast_1d(figure.subplots(rows, 2, sharex=True, sharey=True)).ravel()
     column, row = np.meshgrid(x.values, y.values)
+    largest = grids["largest_peak_torque"]
+    is_crossed = torque_limit is not None and bool(np.any(largest < torque_limit) and np.any(largest > torque_limit))
     for axes, name in zip(panels, drawn, strict=False):
         kind_of_number = "error" if "error" in name else "torque"  # those of a kind have one scale
         _draw_colour_map(axes, x, y, grids[name], [grids[other] for other in drawn if kind_of_number in other])
@@ -385,6 +390,8 @@ def accuracy_map(
         for (label, line), (_, style) in zip(lines.items(), STYLES, strict=False):
             axes.plot(*line, color="white", lw=3.0, ls=style)
             axes.plot(*line, color="black", lw=1.4, ls=style, label=label)
+        if name == "largest_peak_torque" and is_crossed:
+            axes.contour(x.values, y.values, grids[name], [torque_limit], colors=TORQUE_LIMIT, linewidths=2.0)
         axes.set(xlim=limits[0], ylim=limits[1])
         axes.set_title(titles[name], loc="center")
         axes.grid(visible=False)
@@ -400,7 +407,11 @@ def accuracy_map(
         labels.append("a trial failed or did not converge at t_f")
     if not all(np.all(np.isfinite(grids[name])) for name in drawn):
         handles.append(matplotlib.patches.Patch(color=NO_NUMBER))
-        labels.append("no result")
+        labels.append("the panel has no value, see map.csv")
+    if torque_limit is not None and "largest_peak_torque" in drawn:
+        handles.append(matplotlib.lines.Line2D([], [], color=TORQUE_LIMIT if is_crossed else "none", lw=2.0))
+        beyond = "" if is_crossed else ", beyond this map"
+        labels.append(f"limit of peak_torque {torque_limit:g} {unit}{beyond}")
     if handles:
         figure.legend(handles, labels, loc="outside upper left", ncols=2)
     return figure

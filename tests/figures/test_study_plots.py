@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from matplotlib.contour import ContourSet
 from matplotlib.legend import Legend
 
 from ptsmc_jax.figures import run_plots, study_plots
@@ -167,7 +168,23 @@ def test_the_legend_of_a_map_names_what_the_map_shows():
     across = {f"line {k}": (np.array([0.1, 9.0]), np.array([1.0 + 0.1 * k, 2.0])) for k in range(5)}
     grids: dict[str, np.ndarray] = dict.fromkeys(NAMES, np.where(np.eye(2), GRID, np.nan))
     figure = study_plots.accuracy_map(axis, axis, grids, np.zeros((2, 2), bool), outside | across)
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == [*across, "no result"]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == [
+        *across,
+        "the panel has no value, see map.csv",
+    ]
+
+
+@pytest.mark.parametrize(("limit", "drawn"), [(2.5e-5, True), (1.0, False)])
+def test_the_required_torque_is_drawn_on_the_largest_peak_torque(limit, drawn):
+    axis = study_plots.MapAxis("delta [s]", [1.0, 2.0], True)
+    grids: dict[str, np.ndarray] = dict.fromkeys(NAMES, GRID)
+    figure = study_plots.accuracy_map(axis, axis, grids, np.zeros((2, 2), bool), {}, torque_limit=limit)
+    contours = {
+        axes.get_title(): [one for one in axes.collections if isinstance(one, ContourSet)] for axes in figure.axes
+    }
+    assert len(contours["largest peak torque [N m]"]) == sum(map(len, contours.values())) == int(drawn)
+    (text,) = figure.legends[0].get_texts()
+    assert text.get_text() == f"limit of peak_torque {limit:g} N m" + ("" if drawn else ", beyond this map")
 
 
 def test_an_axis_of_whole_numbers_has_no_halves():

@@ -328,23 +328,26 @@ def campaign_gains(**tables: dict[str, Any]) -> Table:
     return campaign_report.gain_table(tables, "spacecraft")
 
 
-def pairs(count: int) -> Iterable[str]:
-    pair = {"status": "simulated", "failures": 0.0, "not_converged": 0.0, "window_error": 2e-6, "peak_torque": 0.3}
+def pairs(count: int, meets: float = math.nan) -> Iterable[str]:
+    pair = {"status": "simulated", "failures": 0.0, "not_converged": 0.0, "window_error": 2e-6, "peak_torque": 0.3,
+            "meets": meets}  # fmt: skip
     every = [
         {**pair, "x": 1.0, "y": 1.0, "failures": 3.0, "window_error": 1e-6},
         {**pair, "x": 1.0, "y": 2.0},
         {**pair, "x": 2.0, "y": 1.0, "not_converged": 2.0, "window_error": 1e-6},
-        {**pair, "x": 2.0, "y": 2.0, "status": "not allowed", "window_error": math.nan},
+        {**pair, "x": 2.0, "y": 2.0, "status": "loop.period is 2", "window_error": math.nan},
+        {**pair, "x": 3.0, "y": 1.0, "window_error": 1e-7, "meets": 0.0 * meets},
     ]
-    return reports.map_lines(every[:count], ("loop.period", "controller.delta"), "spacecraft")
+    return reports.map_lines(every[:count], ("loop.period [s]", "controller.eta"), "spacecraft")
 
 
 def map_of(plant: str) -> Report:
     """Return the report of a map with one pair that was simulated."""
-    head = ["loop.period", "controller.delta", "status", "failures", "not_converged", "window_error", "peak_torque",
-            "linear_window_error", "linear_torque", "hold_delay_margin", "gain_margin"]  # fmt: skip
-    pairs = [["0.1", "1.0", "simulated", "0", "0", "1e-05", "0.25", "5e-06", "0.01", "0.2", "2.0"],
-             ["0.1", "0.05", "not allowed", *([""] * 8)]]  # fmt: skip
+    head = ["loop.period [s]", "controller.delta [s]", "status", "failures", "not_converged", "window_error",
+            "peak_torque", "linear_window_error", "linear_torque", "hold_delay_margin",
+            "gain_margin", "meets"]  # fmt: skip
+    pairs = [["0.1", "1.0", "simulated", "0", "0", "1e-05", "0.25", "5e-06", "0.01", "0.2", "2.0", "0"],
+             ["0.1", "0.05", "controller.delta is 0.05", *([""] * 9)]]  # fmt: skip
     return reports.map_report([head, *pairs], plant)
 
 
@@ -463,6 +466,7 @@ OTHERS: dict[str, Callable[[], Any]] = {
     "map of a spacecraft": lambda: map_of("spacecraft"),
     "map of a chain": lambda: map_of("chain"),
     "one pair of a map": lambda: pairs(1),
+    "best pair of a map that keeps every requirement": lambda: pairs(5, 1.0),
     "comparison of two laws": compared,  # 1.5e+03 times the lower bound are 1500
     "compliance of too few runs": compliance,
     # 1109 runs are needed for 95 % confidence, and all must reach their end

@@ -109,14 +109,14 @@ def test_axes_have_the_units_of_their_keys():
     loaded = scenario.from_tables(tomllib.loads(SHORT))
     shown = {"controller.delta": "[s]", "observer.gain[0]": "[N m s]", "hardware.rate_noise": "[rad/s]"}
     for key, unit in shown.items():
-        assert mapping._label_with_unit(loaded, key) == f"{key} {unit}"
-    assert mapping._label_with_unit(loaded, "controller.eta") == "controller.eta"
+        assert mapping.label_with_unit(loaded, key) == f"{key} {unit}"
+    assert mapping.label_with_unit(loaded, "controller.eta") == "controller.eta"
     assert (
-        mapping._label_with_unit(scenario.from_tables({}), "hardware.delay") == "hardware.delay"
+        mapping.label_with_unit(scenario.from_tables({}), "hardware.delay") == "hardware.delay"
     )  # no table [hardware]
     custom = scenario.read(ROOT / "scenarios" / "own_parts.toml")
-    assert mapping._label_with_unit(custom, "controller.t_f") == "controller.t_f [s]"
-    assert mapping._label_with_unit(custom, "controller.k1") == "controller.k1"  # a custom class states no unit
+    assert mapping.label_with_unit(custom, "controller.t_f") == "controller.t_f [s]"
+    assert mapping.label_with_unit(custom, "controller.k1") == "controller.k1"  # a custom class states no unit
 
 
 @pytest.mark.parametrize(
@@ -175,6 +175,30 @@ def test_cells_agree_with_separate_simulations_of_their_pair(mapped, monkeypatch
             assert (cell.trials, cell.failures) == (6, 0)
             assert np.isfinite(cell.linear_window_error) == (cell.radius < 1.0)
     assert any(cell.radius < 1.0 for cell in cells)
+
+
+def test_a_map_says_which_pairs_keep_every_requirement(monkeypatch):
+    """Earlier, the best pair of a map was the most accurate one, whatever its torque."""
+    text = (
+        CHAIN
+        + "requirements = { peak_torque = { limit = 2.0, quantile = 0.5, confidence = 0.9 }, gain_margin = 3.0 }\n"
+    )
+    asked = []
+
+    def judge_loop(parts, required, *, finished):
+        asked.append(([one.metric for one in required], finished))
+        return [required[0].verdict(np.asarray(9.0), np.asarray(finished))]
+
+    def run(parts, *_):
+        peaks = np.asarray([0.0, 0.0, 0.0, 9.0]) if parts.controller.eta < 3.5 else np.asarray([0.0, 9.0, 9.0, 9.0])
+        metrics = Metrics(dict.fromkeys(CATALOGUE, np.zeros(4)) | {"peak_torque": peaks})
+        return montecarlo.Trials(np.arange(4), metrics, np.full(4, rollout.OK), np.full(4, np.nan), {})
+
+    monkeypatch.setattr(mapping.margin_verdicts, "judge_loop", judge_loop)
+    monkeypatch.setattr(montecarlo, "run", run)
+    _, _, _, cells = simulated("controller.eta=3:4:2", "controller.delta=0.4:0.5:2", text, trials=4)
+    assert [cell.meets for cell in cells] == [1, 0, 1, 0]
+    assert asked == [(["gain_margin"], True)] * 4
 
 
 @pytest.fixture
@@ -268,20 +292,25 @@ def test_period_axis_needs_the_sampled_loop():
 def test_stability_limits_are_drawn_over_period_and_delta_only():
     loaded, x, y = asked("controller.delta=0.2:0.9:2", "loop.period=0.05:0.1:2")
     for clock, factor, label in (("anchored", 1.5, "3/2"), ("flight", 2.5, "1/2")):
-        lines = mapping.stability_limit_curves(scenario.replace(loaded, loop__clock=clock), x, y)
+        lines = mapping.stability_limit_formulas(scenario.replace(loaded, loop__clock=clock), x, y)
         delta, period = lines[f"stability limit $\\delta = (\\eta - {label}) h$"]
         np.testing.assert_allclose(delta, factor * np.asarray(period))
-    lines = mapping.stability_limit_curves(
+    lines = mapping.stability_limit_formulas(
         scenario.replace(loaded, controller__sampling="implicit"), x, y
     )  # the limit of explicit sampling for comparison
     np.testing.assert_allclose(
         lines["stability limit $\\delta = (\\eta - 1/2) h$, of explicit sampling only"][0], 2.5 * np.asarray(y.values)
     )
     delta, period = lines["stability limit with a period of delay"]
-    assert np.all(delta < mapping.stability_limit_curves(loaded, x, y)["stability limit with a period of delay"][0])
-    assert not mapping.stability_limit_curves(loaded, x, mapping.parse_axis("controller.eta=3:4:2", "--y"))
+    assert np.all(delta < mapping.stability_limit_formulas(loaded, x, y)["stability limit with a period of delay"][0])
+    assert not mapping.stability_limit_formulas(loaded, x, mapping.parse_axis("controller.eta=3:4:2", "--y"))
     third = scenario.from_tables({"plant": {"kind": "chain", "order": 3}, "loop": {"mode": "sampled"}})
-    assert not mapping.stability_limit_curves(third, x, y)  # the formula is for plants of order 2
+    assert not mapping.stability_limit_formulas(third, x, y)  # the formula is for plants of order 2
+    # earlier, the formula was drawn for a loop with a lag or a filter, which it ignores
+    for device in ({"torque_lag": 0.1}, {"command_filter": {"kind": "first_order", "corner": 5.0}}):
+        lagging = {f"hardware__{name}": value for name, value in device.items()}
+        assert not mapping.stability_limit_formulas(scenario.replace(loaded, **lagging), x, y)
+    assert not mapping.stability_limit_formulas(scenario.replace(loaded, filter={"kind": "steady_state"}), x, y)
 
 
 def test_map_command_writes_its_result_folder(command, mapped, tmp_path):
@@ -291,11 +320,12 @@ def test_map_command_writes_its_result_folder(command, mapped, tmp_path):
     status, out, _ = command(*asked, "--trials", 6, "--seed", 3)
     assert status == 0
     assert "3 of 4 pairs simulated" in out
+    assert "1 of 4 pairs are not allowed, the first one because controller.delta is 0.1, but must be at least" in out
     folder = tmp_path / "out" / "map-c"
     assert set(tree(folder)) == {"map.csv", "scenario.toml", "versions.json", "figures/map.png"}
     with (folder / "map.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert [float(row["loop.period"]) for row in rows] == [c.x for c in cells]
+    assert [float(row["loop.period [s]"]) for row in rows] == [c.x for c in cells]
     assert [row["status"] for row in rows] == [c.status for c in cells]
     for name in ("window_error", "linear_window_error", "hold_delay_margin"):
         values = [float(row[name] or "nan") for row in rows]
@@ -331,7 +361,7 @@ MODES = ("flexible.frequency[0]=2.0:8.0:3", "controller.delta=1.0:2.0:2", FLEXIB
 
 
 @pytest.mark.usefixtures("not_simulated")
-def test_spillover_limit_separates_stable_and_unstable_pairs(monkeypatch):
+def test_stability_limit_contour_separates_stable_and_unstable_pairs(monkeypatch):
     """The logarithm of the poles is linear in frequency and delta, so that the stability limit is a straight line."""
 
     def at_ends(parts):
@@ -344,7 +374,7 @@ def test_spillover_limit_separates_stable_and_unstable_pairs(monkeypatch):
     monkeypatch.setattr(mapping.run_margins, "margins_at_ends", at_ends)
     loaded, x, y, cells = simulated(*MODES)
     # all pairs are unstable at the hand-over, so that the only limit is in the hold phase
-    ((label, (across, up)),) = mapping.spillover_limit_curves(mapping.Map(loaded, x, y, cells)).items()
+    ((label, (across, up)),) = mapping.stability_limit_contours(mapping.Map(loaded, x, y, cells)).items()
     assert label == "stability limit in the hold phase, linear theory"
     drawn = np.isfinite(across)
     np.testing.assert_allclose(across[drawn], 6.0 - 1.6 * (up[drawn] - 1.5), atol=1e-4)
@@ -360,5 +390,3 @@ def test_spillover_limit_separates_stable_and_unstable_pairs(monkeypatch):
         mapping._with_keys(loaded, {"hardware.gyro_scale[0]": 5.0})
     with pytest.raises(ScenarioError, match=r"flexible.coupling has rows of numbers, but a map changes only a number"):
         mapping._with_keys(loaded, {"flexible.coupling": 5.0})
-    rigid, *_ = asked("loop.period=0.1:0.4:3", "controller.delta=0.5:1:3")
-    assert mapping.spillover_limit_curves(mapping.Map(rigid, x, y, cells)) == {}

@@ -153,9 +153,8 @@ def map_(
         from tuning.output import reports
 
         pairs = [dataclasses.asdict(cell) for cell in results.cells]
-        terminal.print_lines(
-            *reports.map_lines(pairs, (x_axis.key, y_axis.key), loaded.plant.kind), f"results in {folder}"
-        )
+        x_label, y_label = (mapping.label_with_unit(loaded, axis.key) for axis in (x_axis, y_axis))
+        terminal.print_lines(*reports.map_lines(pairs, (x_label, y_label), loaded.plant.kind), f"results in {folder}")
     return 0
 
 

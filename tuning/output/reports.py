@@ -182,29 +182,43 @@ def map_report(rows: Sequence[Sequence[str]], plant: str) -> Report:
 
 
 def map_lines(pairs: Sequence[Mapping[str, Any]], keys: tuple[str, str], plant: str) -> Iterator[str]:
-    """Return the best pair and the number of pairs that were simulated.
+    """Return the best pair, of those that keep every requirement, and the number of pairs that were simulated.
 
     Args:
         pairs: the rows of a map by column; x and y are the values of the keys.
-        keys: keys of the horizontal and of the vertical axis.
+        keys: keys of the horizontal and of the vertical axis, with their units.
         plant: kind of the plant.
     """
     simulated = [pair for pair in pairs if pair["status"] == "simulated"]
     with_error = [pair for pair in simulated if pair["window_error"] == pair["window_error"]]  # is not NaN
     if with_error:
-        best = min(with_error, key=lambda pair: (_count_failures(pair), pair["window_error"]))
+        keeping = [pair for pair in with_error if pair["meets"] == 1]
+        best = min(keeping or with_error, key=lambda pair: (_count_failures(pair), pair["window_error"]))
+        among = f" of the {len(keeping)} pairs that keep every requirement" if keeping else ""
+        if not keeping and best["meets"] == 0:
+            yield "no pair keeps every requirement"
         count = _count_failures(best)
         failures = f"; {count:.0f} of its trials failed or did not converge at t_f" if count else ""
         peak = format_metric(best["peak_torque"], "peak_torque", plant)
         yield (
-            f"the smallest RMS error is {format_error(best['window_error'], plant)} at {keys[0]} = {best['x']:.4g} and "
-            f"{keys[1]} = {best['y']:.4g}, with a mean peak torque of {peak}{failures}"
+            f"the smallest RMS error{among} is {format_error(best['window_error'], plant)} at "
+            f"{_describe_value(keys[0], best['x'])} and {_describe_value(keys[1], best['y'])}, with a mean peak torque "
+            f"of {peak}{failures}"
         )
     failed = sum(_count_failures(pair) > 0 for pair in simulated)
     yield (
         f"{len(simulated)} of {len(pairs)} pairs simulated, {failed} of them with trials that failed or "
         "did not converge at t_f"
     )
+    refused = [pair["status"] for pair in pairs if pair["status"] != "simulated"]
+    if refused:
+        yield f"{len(refused)} of {len(pairs)} pairs are not allowed, the first one because {refused[0]}"
+
+
+def _describe_value(key: str, value: float) -> str:
+    """Return a value of a key, whose unit is in brackets, such as "loop.period = 0.1 s"."""
+    name, _, unit = key.partition(" [")
+    return f"{name} = {value:.4g} {unit.removesuffix(']')}".rstrip()
 
 
 def _count_failures(pair: Mapping[str, Any]) -> float:

@@ -13,12 +13,14 @@ from typing import Any
 import numpy as np
 from contourpy import contour_generator
 
-from ptsmc_jax.campaigns import montecarlo, store
+from ptsmc_jax.campaigns import margin_verdicts, montecarlo, store
 from ptsmc_jax.figures import study_plots, style
 from ptsmc_jax.scenario import Study, custom, errors, keys, parsing, study
 from ptsmc_jax.scenario import replace as replace_keys
+from ptsmc_jax.scenario import requirements as required_by
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.simulation import requirements
 from ptsmc_jax.simulation.rollout import Parts
 from ptsmc_jax.theory import covariance, margins, run_margins, stability_limits
 from tuning.errors import UsageError
@@ -65,6 +67,7 @@ class Cell:
     hold_gain_margin: float = np.nan  # gain margin in the hold phase [dB]
     hold_delay_margin: float = np.nan  # delay margin in the hold phase [s]
     hold_radius: float = np.nan  # spectral radius of the frozen loop in the hold phase [-]
+    meets: float = np.nan  # whether the pair keeps every requirement, 1 or 0; NaN without requirements
 
 
 @dataclass(frozen=True)
@@ -246,6 +249,12 @@ def _simulate_pair(x: float, y: float, ready: Study, parts: Parts, seed: int, tr
         }
     # substeps rounded up to a power of two, so that the cells share few compiled programs of the margins
     parts = replace(parts, substeps=1 << (ready.parts.substeps - 1).bit_length())
+    if ready.requirements or ready.margins:
+        # the trials are too few for a confidence
+        on_trials = [replace(requirement, confidence=None) for requirement in ready.requirements]
+        verdicts = requirements.verdicts(on_trials, lambda name: getattr(simulated.metrics, name), finished)
+        verdicts += margin_verdicts.judge_loop(parts, ready.margins, finished=bool(finished.all()))
+        results["meets"] = int(judging.meets_requirements(verdicts, simulated))
     if ready.scenario.sampled:
         ends = run_margins.margins_at_ends(parts)
         for prefix, (axis_margins, radius) in (("", ends["hand_over"]), ("hold_", ends["hold"])):
@@ -264,7 +273,7 @@ def _simulate_pair(x: float, y: float, ready: Study, parts: Parts, seed: int, tr
     return Cell(x, y, "simulated", count, int(np.sum(~finished)), counts["not_converged"], **results)
 
 
-def stability_limit_curves(scenario: Scenario, x: Axis, y: Axis) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def stability_limit_formulas(scenario: Scenario, x: Axis, y: Axis) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Return the stability limits of the frozen loop at the hand-over in a map of period and delta, by label.
 
     Args:
@@ -274,16 +283,20 @@ def stability_limit_curves(scenario: Scenario, x: Axis, y: Axis) -> dict[str, tu
 
     Returns:
         Coordinates x (points,) and y (points,) of each curve [s], see `stability_limits.smallest_delta`. The result is
-        empty for other keys, for other laws, and for plants whose order is not 2.
+        empty for other keys, for other laws, and for plants whose order is not 2. It is also empty for a loop with a
+        lag, a filter or flexible modes, which the formula ignores.
     """
-    has_formula = scenario.sampled and scenario.controller.law.prescribed and scenario.order == 2
+    devices = scenario.devices
+    has_lag = devices.torque_lag or devices.command_filter or scenario.estimator.on
+    is_ideal = not has_lag and getattr(scenario, "flexible", None) is None
+    has_formula = scenario.sampled and scenario.controller.law.prescribed and scenario.order == 2 and is_ideal
     if {x.key, y.key} != {PERIOD, DELTA} or not has_formula:
         return {}
     eta, delay = scenario.controller.eta, scenario.devices.delay_periods
     h = np.asarray(x.values if x.key == PERIOD else y.values)
     anchored = scenario.loop.clock == "anchored"
     implicit = scenario.controller.implicit
-    formula = f"stability limit $\\delta = (\\eta - {3 if anchored else 1}/2) h$"
+    formula = f"stability limit $\\delta = (\\eta - {3 if anchored else 1}/2) h$" + ", without delay" * (delay > 0)
     # without delay, implicit sampling has no stability limit; the limit of explicit sampling is drawn instead
     label_without_delay = f"{formula}, of explicit sampling only" if implicit else formula
     label_with_delay = "stability limit with {} of delay"
@@ -298,21 +311,20 @@ def stability_limit_curves(scenario: Scenario, x: Axis, y: Axis) -> dict[str, tu
     return curves
 
 
-def spillover_limit_curves(simulated: Map) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return the stability limits of a loop with flexible modes, which the law does not model, by label.
+def stability_limit_contours(simulated: Map) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Return the stability limits of the linearised loop, with all of its devices and modes, by label.
 
-    Each curve is the contour where the spectral radius of the frozen loop is 1, at the hand-over or in the hold phase.
+    Each curve is the contour where the spectral radius of the frozen loop is 1, in the hold phase or, for a
+    prescribed-time law, at the hand-over.
 
     Returns:
-        Coordinates x (points,) and y (points,) of each curve; NaN separates its pieces. Empty without flexible modes.
+        Coordinates x (points,) and y (points,) of each curve; NaN separates its pieces.
     """
-    if getattr(simulated.scenario, "flexible", None) is None:
-        return {}
     axes = simulated.x, simulated.y
     x_values, y_values = (np.log(axis.values) if axis.logarithmic else np.asarray(axis.values) for axis in axes)
     curves = {}
-    phases = {"radius": "at the hand-over", "hold_radius": "in the hold phase"}
-    for name, phase in phases.items():
+    phases = {"radius": "at the hand-over"} if simulated.scenario.controller.law.prescribed else {}
+    for name, phase in (phases | {"hold_radius": "in the hold phase"}).items():
         grid = simulated.grid(name)
         log_radius = np.ma.masked_invalid(np.log(np.where(grid > 0.0, grid, np.nan)))
         pieces: Any = contour_generator(x_values, y_values, log_radius).lines(margins.CIRCLE_TOLERANCE)
@@ -324,7 +336,7 @@ def spillover_limit_curves(simulated: Map) -> dict[str, tuple[np.ndarray, np.nda
     return curves
 
 
-def _label_with_unit(scenario: Scenario, key: str) -> str:
+def label_with_unit(scenario: Scenario, key: str) -> str:
     """Return a key with its unit from the schema of its table; without a unit if the scenario has no such table."""
     table, _, name = key.partition(".")
     declared = getattr(scenario, table, None)
@@ -349,21 +361,25 @@ def write(folder: Path, simulated: Map, seed: int, figures: bool) -> None:
     fields = [name for name in Cell.__dataclass_fields__ if name not in ("x", "y")]
     cells_of = ((cell.x, cell.y, *(getattr(cell, name) for name in fields)) for cell in cells)
     rows = [["" if value != value else value for value in row] for row in cells_of]
-    store.write_csv(folder / "map.csv", [x.key, y.key, *fields], rows)
+    keys_with_units = [label_with_unit(scenario, axis.key) for axis in (x, y)]
+    store.write_csv(folder / "map.csv", [*keys_with_units, *fields], rows)
     if figures:
         names = ("window_error", "linear_window_error", "peak_torque", "largest_peak_torque")
         grids = {name: simulated.grid(name) for name in names}
         if not any(np.isfinite(grid).any() for grid in grids.values()):
             return  # every trial of every pair failed, so that there is nothing to plot
         x_axis, y_axis = (
-            study_plots.MapAxis(_label_with_unit(scenario, axis.key), axis.values, axis.logarithmic) for axis in (x, y)
+            study_plots.MapAxis(label, axis.values, axis.logarithmic)
+            for label, axis in zip(keys_with_units, (x, y), strict=True)
         )
+        limit = next((r.limit for r in required_by(scenario) if r.metric == "peak_torque"), None)
         figure = study_plots.accuracy_map(
             x_axis,
             y_axis,
             grids,
             simulated.grid("failures") + simulated.grid("not_converged") > 0,
-            stability_limit_curves(scenario, x, y) | spillover_limit_curves(simulated),
+            stability_limit_formulas(scenario, x, y) or stability_limit_contours(simulated),
             scenario.plant.kind,
+            limit,
         )
         style.save({"map": figure}, folder / "figures")
