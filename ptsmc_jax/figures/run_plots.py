@@ -103,11 +103,12 @@ def plant_kind(parts: Parts) -> str:
 
 
 def draw_error_limits(axes: Axes, parts: Parts, limits: Mapping[str, float], t_end: float) -> None:
-    """Draw the required limits of the error, each over the interval that it limits; `limits`: see `run_figures`."""
+    """Draw the required limits of the error, each over the interval that it limits; `limits`: see `run_figures`.
+
+    Limits of pointing indices are not drawn: they limit the error about one axis or of the boresight.
+    """
     t_f = float(parts.controller.t_f)
     intervals = {"terminal": (t_f, t_f), "window": (t_f, t_f + float(parts.window)), "hold": (t_f, t_end)}
-    if parts.pointing is not None:
-        intervals["ape"] = t_f + float(parts.pointing.after), t_end
     for metric, limit in limits.items():
         interval = intervals.get(metric.split("_")[0])
         if interval is not None:
