@@ -188,7 +188,10 @@ def inputs(
     outcome: np.ndarray,
     totals: Mapping[str, int],
 ) -> Figure:
-    """Plot metrics (rows) against dispersed quantities (columns), a point a trial, see `torque_by_angle`."""
+    """Plot metrics (rows) against dispersed quantities (columns), a point a trial, see `torque_by_angle`.
+
+    The first quantity explains a metric best.
+    """
     drawn, metrics = in_readable_units(drawn), in_readable_units(metrics)
     rows, columns = len(metrics), len(drawn)
     figure = Figure(figsize=(2.9 * columns + 0.8, 2.4 * rows + 0.7), layout="constrained")
@@ -204,8 +207,8 @@ def inputs(
     for axes, (name, x) in zip(grid[-1], drawn.items(), strict=True):
         axes.set_xlabel(x.label(name))
         axes.xaxis.set_major_locator(MaxNLocator(4))
-    handles, labels = grid[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper right", ncols=min(len(handles), columns), fontsize=9)
+    figure.suptitle(f"Strongest input: {next(iter(drawn))}")
+    legend_below(figure, columns)
     return figure
 
 

@@ -181,6 +181,7 @@ def profiles(gains: Mapping[str, Profile], goal: str) -> Figure:
         if is_log_scaled(profile.gain[0], profile.gain[-1]):
             logarithmic(ax, "x")
         ax.set(xlabel=f"{name} [{profile.unit}]", ylabel=goal)
+    axes[0].set_title("Objective along each gain, the other gains as tuned", loc="left")
     plain_ticks(axes[0].yaxis)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=2, fontsize=9)
     return figure
@@ -230,10 +231,13 @@ def tradeoff(
 def settling_by_angle(sets: Mapping[str, tuple[np.ndarray, np.ndarray]], t_f: float) -> Figure:
     """Plot settling time [s] against initial angle [deg]; `sets`: label -> (angles, times), NaN: never settles."""
     figure, axes = new_figure("Settling time by initial angle", "settling time [s]")
-    for (label, (angle, time)), (colour, marker) in zip(sets.items(), _colours_and_markers(len(sets)), strict=True):
+    looks = zip(sets.items(), _colours_and_markers(len(sets)), range(len(sets), 0, -1), strict=True)
+    for (label, (angle, time)), (colour, marker), above in looks:  # the first set is drawn above the others
         settled, name = np.isfinite(time), label.replace("_", " ")
         name = name if np.all(settled) else f"{name}: {np.count_nonzero(~settled)} never"
-        axes.plot(angle[settled], time[settled], marker, ms=3.5, alpha=0.5, color=colour, mew=0, label=name)
+        axes.plot(
+            angle[settled], time[settled], marker, ms=3.5, alpha=0.8, color=colour, mew=0, label=name, zorder=2 + above
+        )
     axes.axhline(t_f, color="0.3", lw=0.9, ls=":")
     axes.annotate("$t_f$", (1.0, t_f), xycoords=("axes fraction", "data"), xytext=(4, 0), textcoords="offset points",
                   va="center")  # fmt: skip

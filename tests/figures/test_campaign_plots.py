@@ -50,6 +50,19 @@ def test_each_outcome_is_counted_and_drawn():
     assert axes.get_ylim() == pytest.approx((simulated.min() / 1.3, simulated.max() * 1.3))
 
 
+@pytest.mark.parametrize("count", [1, 4])
+def test_the_title_of_inputs_names_the_strongest_and_is_inside_the_figure(count):
+    outcome, x = np.full(3, campaign_plots.AT_TIMES, dtype=object), np.arange(1.0, 4.0)
+    drawn = {f"initial_angle_{k}": campaign_plots.Column("rad", x) for k in range(count)}
+    metrics = {"peak_torque": campaign_plots.Column("N m", x, 2.0)}
+    figure = campaign_plots.inputs(drawn, metrics, outcome, {campaign_plots.AT_TIMES: 3})
+    figure.draw_without_rendering()
+    assert figure.get_suptitle() == "Strongest input: initial_angle_0"
+    for artist in (*figure.legends, *figure.texts):
+        box = artist.get_window_extent()
+        assert 0.0 <= box.x0 < box.x1 <= figure.bbox.x1
+
+
 @pytest.mark.parametrize("limit", [1e-3, 1e3])
 def test_a_limit_in_the_legend_is_on_the_axis(limit):
     """An earlier version lost the line of 0.5 N m on an axis of 10 kN m, the commanded torque."""

@@ -80,6 +80,7 @@ def test_profiles_name_the_violated_limit_and_their_numbers_do_not_overlap(low, 
     figure = study_plots.profiles({"sign_width": study_plots.Profile("-", at, at, over, nearest, 1e-3)}, "objective")
     (axes,) = figure.axes
     drawn = {line.get_label(): np.asarray(line.get_xdata()).tolist() for line in axes.lines}
+    assert axes.get_title(loc="left")
     assert drawn["limits kept"] == [at[1]]
     assert drawn["beyond the limit of peak_torque"] == [at[0], at[3]]
     assert drawn["beyond the limit of gain_margin"] == [at[2]]

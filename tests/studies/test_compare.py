@@ -13,7 +13,7 @@ import pytest
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.campaigns.store import RefusedError
-from ptsmc_jax.figures import study_plots
+from ptsmc_jax.figures import study_plots, style
 from ptsmc_jax.scenario import systems
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.law_tables import BASELINES
@@ -212,6 +212,15 @@ def test_every_law_appears_in_table_page_and_figures(eight, tmp_path):
     drawn = [line for line in figures["settling"].axes[0].lines if line.get_marker() in study_plots.MARKERS]
     looks = {(line.get_color(), line.get_marker()) for line in drawn}
     assert len(drawn) == len(looks) == len(names)
+    # earlier, the points of all other laws covered those of the published gains
+    order = [str(line.get_label()) for line in sorted(drawn, key=lambda line: -line.get_zorder())]
+    assert order[:2] == ["prescribed time", "published"]
+    # the same colours as in the figures of a tuning
+    of_tuning = study_plots.tradeoff({name: (np.ones(2), np.ones(2)) for name in ("tuned", "published")}, {})
+    for figure in (figures["settling"], figures["tradeoff"], of_tuning):
+        colours = {str(line.get_label()).split(":")[0]: line.get_color() for line in figure.axes[0].lines}
+        tuned = colours["tuned" if figure is of_tuning else "prescribed time"]
+        assert (tuned, colours["published"]) == (style.STYLES[0][0], style.STYLES[1][0])
 
 
 def test_settling_times_of_small_and_large_initial_angles():

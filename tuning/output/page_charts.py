@@ -125,6 +125,8 @@ def front(pareto: Front, torque_limit: float | None) -> Chart:
         pareto: the front of error against torque.
         torque_limit: required limit on the peak torque [N m]; None: no limit.
     """
+    # the colours of `study_plots.front`
+    colours = (COLOURS[0], COLOURS[3], "#999", *COLOURS[1:3])
     groups: list[tuple[str, list[Point], Chart]] = [
         ("front", pareto.non_dominated, {"mode": "lines+markers", "marker": {"size": 8}, "line": {"shape": "hv"}}),
         ("knee", [p for p in pareto.non_dominated if p.knee],
@@ -147,7 +149,7 @@ def front(pareto: Front, torque_limit: float | None) -> Chart:
                 "type": "scatter", "name": name, "x": [p.peak for p in group], "y": rms.tolist(),
                 "text": [", ".join(f"{g} {v:.4g}" for g, v in p.gains.items()) for p in group],
                 "hovertemplate": "%{text}<br>error %{y:.3g} " + unit + ", peak %{x:.4g}<extra>" + name + "</extra>",
-                "error_y": bars, **style, "marker": {**style["marker"], "color": COLOURS[k % len(COLOURS)]},
+                "error_y": bars, **style, "marker": {**style["marker"], "color": colours[k]},
             })  # fmt: skip
     x_axis = {"title": {"text": f"peak torque [{unit_of('peak_torque', pareto.plant)}]"}, **_DECADES}
     y_axis = {"title": {"text": f"RMS {error} in the window [{unit}]"}, **_DECADES}

@@ -412,8 +412,9 @@ def _csv_table(scenario: Scenario, content: Mapping[str, Any]) -> tuple[list[str
 
 
 def _plot_figures(comparison: Comparison) -> Iterator[tuple[str, Figure]]:
-    trials_by_law = {law: contender.trials for law, contender in comparison.contenders.items()}
     ours = comparison.contenders[OURS]
+    # the tuned law is first, as in the figures of `tune`, and has the same colour there
+    trials_by_law = {law: contender.trials for law, contender in {OURS: ours, **comparison.contenders}.items()}
     t_f = ours.simulated.controller.t_f
     yield "settling", study_plots.settling_by_angle(
         {law: (np.degrees(t.drawn["initial_angle"]), np.where(t.finished, t.metrics.settling_time, np.nan))
