@@ -7,16 +7,18 @@ blank: a sensor has no reading in that row, or a command holds its last value.
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 import polars as pl
 from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 
+from ptsmc_jax import formulas
 from ptsmc_jax.campaigns import run_tables
 from ptsmc_jax.campaigns.store import RefusedError
-from ptsmc_jax.scenario.identify_tables import StateTelemetry, Telemetry
+from ptsmc_jax.scenario.disturbance_tables import largest_disturbance
+from ptsmc_jax.scenario.identify_tables import Identify, RateUnit, SpeedUnit, StateTelemetry, Telemetry, TorqueUnit
 from ptsmc_jax.scenario.parsing import nearest_name_hint
 from ptsmc_jax.scenario.spacecraft_scenario import SpacecraftScenario
 from ptsmc_jax.scenario.tables import Scenario
@@ -29,7 +31,13 @@ MAX_GYRO_DIFFERENCE = 0.5  # largest median difference between attitude and gyro
 OUTLIER_RATIO = 10.0  # third difference of an outlier, relative to the median
 MIN_TURN = 0.02  # smallest rotation of a part of a log in which attitude and gyro are compared [rad]
 MIN_TURN_TO_NOISE = 10.0  # smallest ratio of this rotation to the noise of an attitude
-COMPARED_PARTS = 400  # number of parts of a log in which attitude and gyro are compared
+COMPARED_PARTS = (400, 100, 25)  # numbers of parts of a log in which signals are compared; the first that suits
+MAX_BIAS = 0.06  # largest gyro bias that may explain a difference between attitude and gyro [rad/s]
+MAX_UNIT_DIFFERENCE = 0.2  # largest median difference between attitude and gyro in the unit that an error suggests
+MIN_CORRELATION = 0.9  # smallest correlation of torque and motion with which their sizes are compared
+MIN_TORQUE_TO_DISTURBANCE = 2.0  # smallest ratio of RMS torque to the largest disturbance in this comparison
+UNIT_RATIO_ERROR = 2.0  # largest factor between a ratio of torque and motion and the ratio of two units
+MAX_TORQUE_RATIO = 30.0  # largest ratio of torque and motion, or of motion and torque, without a unit that explains it
 Values = np.ndarray
 
 
@@ -185,27 +193,30 @@ def _read_spacecraft_log(scenario: Any, table: _Table) -> Measurements:
     columns = config.attitude or _numbered_columns("measured_q", 4)
     if config.attitude is not None or logged.intersection(columns):
         readings["attitude"] = _read_attitudes(config, table, columns)
-    columns = config.rate or _numbered_columns("measured_w", 3)
-    if config.rate is not None or logged.intersection(columns):
-        readings["rate"] = table.read_vectors(columns, UNITS["rad/s"][config.rate_unit])
+    rate_columns = config.rate or _numbered_columns("measured_w", 3)
+    if config.rate is not None or logged.intersection(rate_columns):
+        readings["rate"] = table.read_vectors(rate_columns, UNITS["rad/s"][config.rate_unit])
     if not readings or all(np.isnan(values).all() for values in readings.values()):
         raise RefusedError(
             f"{table.name} has no attitude and no rate, but must have one of them; name the columns in [telemetry], "
             "such as attitude = [..] or rate = [..]"
         )
+    command_columns = config.wheel_torque or config.wheel_speed or config.torque or _numbered_columns("sent", 3)
     command, by_channel = _read_torques_or_speeds(scenario, config, table, t)
     age_column = config.attitude_age or ("measured_age" if "measured_age" in logged else None)
     if age_column is not None and "attitude" in readings:
         ages = np.nan_to_num(table.read_numbers([age_column])[:, 0])
         table.check_rows(ages < 0.0, age_column, "an age of at least 0 s")
         t, readings, command = _move_to_measurement_times(t, ages, readings, command)
-    _check_rates_match_attitudes(table, t, readings)
+    _check_rates_match_attitudes(table, rate_columns, config.rate_unit, t, readings)
+    inertia = config.wheel_inertia if config.wheel_speed is not None else None
+    log = Measurements(table.name, t, readings, command, by_channel, inertia)
+    _check_torques_match_motion(scenario, config, command_columns, log)
     main_readings = readings.get("attitude", readings.get("rate"))
     assert main_readings is not None
     start = _find_start_row(t, readings, ~np.isnan(main_readings[:, 0]))
     kept_readings = {name: values[start:] for name, values in readings.items()}
-    inertia = config.wheel_inertia if config.wheel_speed is not None else None
-    return Measurements(table.name, t[start:] - t[start], kept_readings, command[start:], by_channel, inertia)
+    return log._replace(t=t[start:] - t[start], readings=kept_readings, command=command[start:])
 
 
 def _find_start_row(t: Values, readings: dict[str, Values], is_complete: Values) -> int:
@@ -311,40 +322,145 @@ def estimate_noise(values: np.ndarray, axis: int | None = None) -> Any:
     return 1.4826 * np.median(np.abs(np.diff(values, 3, axis=0)), axis=axis) / np.sqrt(20.0)
 
 
-def _check_rates_match_attitudes(table: _Table, t: Values, readings: dict[str, Values]) -> None:
+def _check_rates_match_attitudes(
+    table: _Table, columns: Sequence[str], unit: str, t: Values, readings: dict[str, Values]
+) -> None:
     """Raise RefusedError if the attitudes and the rates describe different motions.
 
     The sum of the rotations from sample to sample over each part of the log is compared with the integral of the rate.
     Parts that turn by less than `MIN_TURN`, by little compared with the noise of the attitudes, or by more than 0.5 rad
-    between two samples, are ignored. Medians of three readings replace the readings, so that a part with an outlier
-    does not seem to turn.
+    between two samples, are ignored. Longer parts follow if less than five parts are left. Medians of three readings
+    replace the readings, so that a part with an outlier does not seem to turn.
+
+    Args:
+        table: the log.
+        columns: columns of the rates.
+        unit: unit of the rates in the scenario.
+        t: times [s].
+        readings: readings by name.
     """
     if set(readings) != {"attitude", "rate"}:
         return
     q, rate = readings["attitude"], readings["rate"]
     common_rows = np.flatnonzero(~np.isnan(q[:, 0]) & ~np.isnan(rate[:, 0]))
-    part_ends = np.arange(0, common_rows.size, max(1, common_rows.size // COMPARED_PARTS))
-    if part_ends.size < MIN_ROWS:
+    if common_rows.size < MIN_ROWS:
         return
-    has_rate = ~np.isnan(rate[:, 0])
-    smooth_rate = median_filter(rate[has_rate], (3, 1))
-    interpolated = np.stack([np.interp(t, t[has_rate], column) for column in smooth_rate.T], axis=1)
-    increments = 0.5 * (interpolated[1:] + interpolated[:-1]) * np.diff(t)[:, None]
-    integral = np.concatenate([np.zeros((1, 3)), np.cumsum(increments, axis=0)])[common_rows]
+    integral = _integrate(t, _smooth_rates(t, rate))[common_rows]
     attitudes = Rotation.from_quat(q[common_rows])
     rotations = (attitudes[:-1].inv() * attitudes[1:]).as_rotvec()
     turns = np.concatenate([np.zeros((1, 3)), np.cumsum(rotations, axis=0)])
-    noise = estimate_noise(turns)
+    smallest_turn = max(MIN_TURN, MIN_TURN_TO_NOISE * estimate_noise(turns))
     turns = median_filter(turns, (3, 1))
-    turn, rate_turn = (np.diff(values[part_ends], axis=0) for values in (turns, integral))
-    largest_step = np.maximum.reduceat(np.linalg.norm(rotations, axis=1), part_ends[:-1])
-    angle, difference = np.linalg.norm(turn, axis=1), np.linalg.norm(turn - rate_turn, axis=1)
-    is_comparable = (angle > max(MIN_TURN, MIN_TURN_TO_NOISE * noise)) & (largest_step < 0.5)
-    if is_comparable.sum() < 5:
+    for count in COMPARED_PARTS:
+        ends = np.arange(0, common_rows.size, max(1, common_rows.size // count))
+        turn, rate_turn, duration = (np.diff(v[ends], axis=0) for v in (turns, integral, t[common_rows, None]))
+        largest_step = np.maximum.reduceat(np.linalg.norm(rotations, axis=1), ends[:-1])
+        angle = np.linalg.norm(turn, axis=1)
+        is_comparable = (angle > smallest_turn) & (largest_step < 0.5)
+        if is_comparable.sum() >= 5:
+            break
+    else:
         return
-    median_ratio = np.median(difference[is_comparable] / angle[is_comparable])
-    if median_ratio > MAX_GYRO_DIFFERENCE:
+    turn, rate_turn, duration, angle = (v[is_comparable] for v in (turn, rate_turn, duration, angle))
+
+    def median_difference(rate_turn: Values) -> float:
+        return float(np.median(np.linalg.norm(rate_turn - turn, axis=1) / angle))
+
+    if median_difference(rate_turn) <= MAX_GYRO_DIFFERENCE:
+        return
+    ratio = np.median(np.linalg.norm(rate_turn, axis=1) / angle)
+    message = (
+        f"{table.name} has rates that do not fit its attitudes: the columns {', '.join(columns)} integrate to "
+        f"{ratio:.3g} times the rotation"
+    )
+    units = UNITS["rad/s"]
+    differences = {other: median_difference(units[other] / units[unit] * rate_turn) for other in get_args(RateUnit)}
+    likely_unit = min(differences, key=lambda other: differences[other])
+    if differences[likely_unit] < MAX_UNIT_DIFFERENCE:
+        raise RefusedError(f'{message}; set telemetry.rate_unit = "{likely_unit}", which fits')
+    bias = np.clip(np.median((rate_turn - turn) / duration, axis=0), -MAX_BIAS, MAX_BIAS)
+    if median_difference(rate_turn - bias * duration) > MAX_GYRO_DIFFERENCE:
         raise RefusedError(
-            f"{table.name} has rates that do not fit its attitudes: their integral differs from the rotation by a "
-            f"median of {100.0 * median_ratio:.3g} %; check telemetry.rate_unit, order and rotation"
+            f"{message}, and differ from it by a median of {100.0 * differences[unit]:.3g} %; check "
+            "telemetry.rate_unit, order and rotation"
         )
+
+
+def _smooth_rates(t: Values, rate: Values) -> Values:
+    """Return the medians of three rates (rows, 3) [rad/s], interpolated where a rate is missing."""
+    has_rate = ~np.isnan(rate[:, 0])
+    return np.stack([np.interp(t, t[has_rate], column) for column in median_filter(rate[has_rate], (3, 1)).T], axis=1)
+
+
+def _integrate(t: Values, values: Values) -> Values:
+    """Return the integral (rows, n) of values from the first time on, by the trapezoidal rule."""
+    increments = 0.5 * (values[1:] + values[:-1]) * np.diff(t)[:, None]
+    return np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(increments, axis=0)])
+
+
+def _check_torques_match_motion(
+    scenario: SpacecraftScenario, config: Telemetry, columns: Sequence[str], log: Measurements
+) -> None:
+    """Raise RefusedError if the motion shows that the torques or the speeds of the wheels are in another unit.
+
+    The mean of J w in each part of the log, less that of the part before, is compared with the same difference of the
+    commanded impulse. Both must be correlated, so that noise or a fast rotation is no error of a unit. An actuator that
+    compensates a disturbance hardly moves the body. Torques that are not above the disturbances of the scenario are
+    therefore not compared.
+
+    Args:
+        scenario: a spacecraft.
+        config: its table [telemetry].
+        columns: columns of the torques or speeds.
+        log: the log.
+    """
+    axes = scenario.wheels.spin_axes() if log.by_channel and scenario.wheels is not None else np.eye(3)
+    walk, disturbance = (scenario.identify or Identify()).torque_walk, largest_disturbance(scenario)
+    if walk or disturbance is None:
+        return
+    t, interval = log.t, np.append(np.diff(log.t), 0.0)[:, None]
+    if log.wheel_inertia is not None:
+        impulse = -log.wheel_inertia * (log.command - log.command[0]) @ axes
+    else:
+        impulse = np.cumsum(log.command * interval, axis=0) @ axes
+        impulse = np.concatenate([np.zeros((1, 3)), impulse[:-1]])
+    rate = log.readings.get("rate", np.full((1, 3), np.nan))
+    if np.isfinite(rate).any():
+        rate_t = t
+    else:
+        has_attitude = ~np.isnan(log.readings["attitude"][:, 0])
+        if has_attitude.sum() < MIN_ROWS:
+            return
+        attitudes, times = Rotation.from_quat(log.readings["attitude"][has_attitude]), t[has_attitude]
+        rate_t = 0.5 * (times[1:] + times[:-1])
+        rate = (attitudes[:-1].inv() * attitudes[1:]).as_rotvec() / np.diff(times)[:, None]
+    momentum = _smooth_rates(rate_t, rate) @ formulas.check_inertia(scenario.true_inertia)
+    impulse = np.stack([np.interp(rate_t, t, column) for column in impulse.T], axis=1)
+    for count in COMPARED_PARTS:
+        starts = np.arange(0, rate_t.size, max(1, rate_t.size // count))
+        sizes = np.diff(np.append(starts, rate_t.size))[:, None]
+        change, commanded = (np.diff(np.add.reduceat(v, starts) / sizes, axis=0) for v in (momentum, impulse))
+        product, largest = np.sum(change * commanded), np.linalg.norm(change) * np.linalg.norm(commanded)
+        if starts.size >= MIN_ROWS and abs(product) > MIN_CORRELATION * largest:
+            break
+    else:
+        return
+    ratio = product / np.sum(commanded**2)
+    torque = np.sqrt(np.mean(np.square(np.diff(impulse, axis=0) / np.diff(rate_t)[:, None])))
+    if max(1.0, abs(ratio)) * torque < MIN_TORQUE_TO_DISTURBANCE * disturbance[0]:
+        return
+    key, kinds = ("speed_unit", SpeedUnit) if log.wheel_inertia is not None else ("torque_unit", TorqueUnit)
+    units, unit = UNITS["rad/s" if log.wheel_inertia is not None else "N m"], getattr(config, key)
+    errors = {other: abs(np.log(abs(ratio) * units[unit] / units[other])) for other in get_args(kinds)}
+    likely_unit = min(errors, key=lambda other: errors[other])
+    fits = errors[likely_unit] < np.log(UNIT_RATIO_ERROR)
+    message = (
+        f"{log.name} has {'wheel speeds' if log.wheel_inertia is not None else 'torques'} that do not fit its motion: "
+        f"the momentum changes by {ratio:.3g} times the impulse of the columns {', '.join(columns)}"
+    )
+    if fits and likely_unit != unit:
+        raise RefusedError(f'{message}; set telemetry.{key} = "{likely_unit}", which fits, or check spacecraft.inertia')
+    if fits and ratio < 0.0:
+        raise RefusedError(f"{message}; check the signs of these columns")
+    if abs(np.log(abs(ratio))) > np.log(MAX_TORQUE_RATIO):
+        raise RefusedError(f"{message}; check telemetry.{key} and spacecraft.inertia")

@@ -13,6 +13,9 @@ Quaternion = Annotated[
     tuple[Column, Column, Column, Column],
     Meta(description="a list of four names of columns, in the order of `quaternion_order`"),
 ]
+RateUnit = Literal["rad/s", "deg/s", "deg/h"]
+TorqueUnit = Literal["N m", "mN m", "uN m"]
+SpeedUnit = Literal["rad/s", "rpm"]
 Axes = Annotated[tuple[Column, Column, Column], Meta(description="a list of three names of columns")]
 
 
@@ -33,7 +36,7 @@ class Telemetry(Table, frozen=True):
     rate: Annotated[Axes | None, Meaning("body rate of the gyro; default: measured_w1 to measured_w3, if logged")] = (
         None
     )
-    rate_unit: Annotated[Literal["rad/s", "deg/s", "deg/h"], Meaning("unit of the rate columns")] = "rad/s"
+    rate_unit: Annotated[RateUnit, Meaning("unit of the rate columns")] = "rad/s"
     torque: Annotated[
         Axes | None,
         Meaning(
@@ -44,11 +47,11 @@ class Telemetry(Table, frozen=True):
     wheel_torque: Annotated[
         Columns | None, Meaning("instead of torque: commanded torque of each wheel on the body about its axis")
     ] = None
-    torque_unit: Annotated[Literal["N m", "mN m", "uN m"], Meaning("unit of the torque columns")] = "N m"
+    torque_unit: Annotated[TorqueUnit, Meaning("unit of the torque columns")] = "N m"
     wheel_speed: Annotated[
         Columns | None, Meaning("instead of torque: measured speed of each wheel relative to the body")
     ] = None
-    speed_unit: Annotated[Literal["rad/s", "rpm"], Meaning("unit of the speed columns")] = "rad/s"
+    speed_unit: Annotated[SpeedUnit, Meaning("unit of the speed columns")] = "rad/s"
     wheel_inertia: Annotated[
         Positive | None, Meaning("spin inertia of each wheel; needed with wheel_speed", "kg m^2")
     ] = None

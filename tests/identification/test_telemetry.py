@@ -12,6 +12,7 @@ from ptsmc_jax.campaigns.store import RefusedError
 from ptsmc_jax.identification import telemetry
 from ptsmc_jax.scenario.errors import ScenarioError
 from tests.helpers import refuses
+from tests.identification import synthetic
 
 ROWS = 40
 T = 0.5 * np.arange(ROWS)
@@ -178,6 +179,54 @@ def test_a_log_of_a_slow_slew_with_outliers_or_coarse_attitudes_is_accepted(nois
     """Only errors of the attitude turn by more than 0.02 rad from sample to sample."""
     log = telemetry.measurements(loaded(), slow_log(noise, outliers))
     assert len(log.t) >= 390
+
+
+def test_rates_of_a_slow_slew_in_another_unit_are_refused_with_that_unit():
+    """Regression: parts of fixed length turned by less than 0.02 rad, and no part of the log was compared."""
+    rows = slow_log(1e-4, 0).with_columns(pl.col(f"measured_w{k}") * 180.0 / np.pi for k in (1, 2, 3))
+    with refuses(RefusedError, 'times the rotation; set telemetry.rate_unit = "deg/s"'):
+        telemetry.measurements(loaded(), rows)
+    assert len(telemetry.measurements(loaded(rate_unit="deg/s"), rows).t) >= 390
+
+
+def test_a_large_gyro_bias_is_no_error_of_the_unit():
+    rows = slow_log(1e-4, 0).with_columns(pl.col(f"measured_w{k}") + 0.02 for k in (1, 2, 3))
+    assert len(telemetry.measurements(loaded(), rows).t) >= 390
+
+
+@pytest.mark.parametrize(
+    ("kind", "factor", "words"),
+    [
+        ("sent", 1.0, None),
+        ("sent", 1e3, 'columns sent1, sent2, sent3; set telemetry.torque_unit = "mN m"'),
+        ("sent", 1e-3, "check telemetry.torque_unit and spacecraft.inertia"),
+        ("sent", -1.0, "check the signs"),
+        ("speed", 1.0, None),
+        ("speed", 30.0 / np.pi, 'columns speed1, speed2, speed3; set telemetry.speed_unit = "rpm"'),
+    ],
+)
+@pytest.mark.parametrize("reading", ["measured_q", "measured_w"])
+def test_torques_and_wheel_speeds_in_another_unit_are_refused_with_that_unit(reading, kind, factor, words):
+    names = [f"{kind}{k}" for k in (1, 2, 3)]
+    tables = {
+        "spacecraft": {"inertia": [0.05, 0.09, 0.11]}, "loop": {"mode": "sampled"}, "wheels": {"kind": "axes"},
+        "disturbance": {"kind": "none"},
+        "telemetry": {"wheel_speed": names, "wheel_inertia": synthetic.SPIN_INERTIA} if kind == "speed" else {},
+    }  # fmt: skip
+    (rows,), _ = synthetic.logs(np.random.default_rng(0), np.diag([0.06, 0.08, 0.12]), wheels=True)
+    rows = rows.select("t", *names, pl.col(f"^{reading}.$")).with_columns(pl.col(name) * factor for name in names)
+    with refuses(RefusedError, words) if words else nullcontext():
+        telemetry.measurements(scenario.from_tables(tables), rows)
+
+
+def test_torques_that_compensate_a_disturbance_are_accepted():
+    """A hold: the body moves by a thousandth of what the torque alone would cause."""
+    t = np.arange(600) / 10.0
+    torque = 5e-3 * np.sin(t[:, None] / 3.0 + np.arange(3.0))
+    rate = np.cumsum(1e-3 * torque / 10.0, axis=0) / 10.0
+    columns = {"t": t} | {f"measured_w{k + 1}": rate[:, k] for k in range(3)}
+    columns |= {f"sent{k + 1}": torque[:, k] for k in range(3)}
+    assert telemetry.measurements(loaded(), pl.DataFrame(columns)).t.size > 500
 
 
 @pytest.mark.parametrize(
