@@ -598,10 +598,10 @@ def _build_result(
     logs: Sequence[Measurements],
     validation_logs: Sequence[Measurements],
 ) -> Identification:
-    z, zero, has_prior = best.z, np.zeros(problem.size), problem.has_prior()
+    z, zero = best.z, np.zeros(problem.size)
     by_z, by_start = problem.derivatives(z), problem.derivatives(zero)
-    prior_std = np.sqrt(np.sum(by_start[:, has_prior] ** 2, axis=1))
-    prior_std = np.where(np.any(by_start[:, ~has_prior] != 0.0, axis=1) | (prior_std == 0.0), np.inf, prior_std)
+    has_prior = [parameter.has_prior for parameter in problem.parameters for _ in parameter.labels]
+    prior_std = np.where(has_prior, np.linalg.norm(by_start, axis=1), np.inf)
 
     def fit_log(log: Measurements, is_validation: bool = False) -> Fit:
         prepared = prepare_log(problem, log)

@@ -488,24 +488,29 @@ def _coupling_parameter(model: Model, sigmas: np.ndarray, has_prior: bool) -> Pa
 
 
 def _inertia_parameter(start: np.ndarray, prior: object) -> Parameter:
-    """Return the inertia parameter, in log-Cholesky coordinates of the pseudo-inertia. Every value is physical."""
+    """Return the inertia parameter, in log-Cholesky coordinates of the pseudo-inertia. Every value is physical.
+
+    The prior covariance is that of the dispersion, to first order in the rotation of the principal axes. The axes are
+    known if the dispersion does not rotate them. The estimate then has the principal axes of the scenario.
+    """
     table = getattr(prior, "inertia", None)
-    root = vector(numbers.pseudo_root(start))
     if table is not None and hasattr(table, "factor"):
-        factor = table.matrix()
+        root, factor = numbers.pseudo_root(start), table.matrix()
     else:
-        std = USUAL_SIGMA["inertia"] if table is None else max(table.std, 1e-6)
-        rotation_sigma = std if table is None or not table.axes_deg else np.deg2rad(table.axes_deg)
+        usual = USUAL_SIGMA["inertia"]
+        std, turn = (usual, usual) if table is None else (max(table.std, 1e-6), np.deg2rad(table.axes_deg))
         moments, axes = np.linalg.eigh(start)
+        root = axes @ numbers.pseudo_root(np.diag(moments))  # a diagonal L keeps the principal axes
         changes = [std * moments[k] * np.outer(axes[:, k], axes[:, k]) for k in range(3)]
-        for k in range(3):
-            cross = np.cross(np.eye(3), axes[:, k]).T * -1.0
-            changes.append(rotation_sigma * (cross @ start - start @ cross))
+        for i, j in ((0, 1), (0, 2), (1, 2)) if turn else ():  # products of inertia in the principal axes
+            sigma = turn * np.sqrt((moments[i] - moments[j]) ** 2 + std**2 * (moments[i] ** 2 + moments[j] ** 2))
+            product = np.outer(axes[:, i], axes[:, j])
+            changes.append(sigma * (product + product.T))
         by_prior = np.stack([np.asarray(_upper_triangle(jnp.asarray(change))) for change in changes], axis=1)
-        factor = np.linalg.solve(inertia_derivatives(start), _raise_singular_values(by_prior, std * np.min(moments)))
+        factor = np.linalg.solve(inertia_derivatives(root), by_prior)
 
     def write(model: Model, c: Array) -> Model:
-        inertia = numbers.from_coordinates(root, c)
+        inertia = numbers.from_coordinates(vector(root), c)
         plant = model.plant.with_inertia(inertia, matrices.solve(inertia, jnp.eye(3)))
         return replace(model, plant=plant, disturbance=disturbances.on_body(model.disturbance, inertia))
 
@@ -515,23 +520,12 @@ def _inertia_parameter(start: np.ndarray, prior: object) -> Parameter:
     return Parameter("inertia", labels, "kg m^2", factor, table is not None, write, read, common)
 
 
-def inertia_derivatives(inertia: np.ndarray) -> np.ndarray:
-    """Return the derivatives (6, 6) [kg m^2] of the entries of an inertia (3, 3) by its log-Cholesky coordinates."""
-    root = vector(numbers.pseudo_root(inertia))
-    return np.asarray(jax.jacfwd(lambda c: _upper_triangle(numbers.from_coordinates(root, c)))(jnp.zeros(6)))
+def inertia_derivatives(root: np.ndarray) -> np.ndarray:
+    """Return the derivatives (6, 6) [kg m^2] of the entries of an inertia by its log-Cholesky coordinates.
 
-
-def _raise_singular_values(factor: np.ndarray, size: float) -> np.ndarray:
-    """Return a factor of the prior covariance of the inertia's entries with singular values of at least 0.3 `size`.
-
-    With equal moments of inertia the principal axes are arbitrary, and the factor would be singular.
-
-    Args:
-        factor: a factor of this covariance (6, 6) [kg m^2].
-        size: prior 1 sigma of the smallest principal moment [kg m^2].
+    root: factor of its pseudo-inertia (3, 3), see `numbers.pseudo_root`.
     """
-    u, s, vt = np.linalg.svd(factor)
-    return (u * np.maximum(s, 0.3 * size)) @ vt
+    return np.asarray(jax.jacfwd(lambda c: _upper_triangle(numbers.from_coordinates(vector(root), c)))(jnp.zeros(6)))
 
 
 def _upper_triangle(inertia: Array) -> Array:

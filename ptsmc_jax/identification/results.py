@@ -6,6 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from ptsmc_jax.dispersions.numbers import pseudo_root
 from ptsmc_jax.dispersions.quantities import PAIRS
 from ptsmc_jax.identification import parameters
 from ptsmc_jax.identification.estimation import LAGS, Fit, Identification
@@ -81,7 +82,8 @@ def _write_estimate(
 
 
 def _relative_dispersion(std: np.ndarray, values: np.ndarray) -> dict[str, object]:
-    largest = min(np.max(std / np.abs(values), initial=0.0), MAX_STD)
+    is_uncertain = std > 0.0  # a value of zero may be fixed
+    largest = min(np.max(std[is_uncertain] / np.abs(values[is_uncertain]), initial=0.0), MAX_STD)
     return {"kind": "relative_normal", "std": float(largest)}
 
 
@@ -133,7 +135,7 @@ def _inertia_factor(identification: Identification, tensor: np.ndarray) -> list[
     """Return the rows of a lower triangular factor of the covariance of the inertia's log-Cholesky coordinates."""
     first = identification.problem.labels.index("inertia_11")
     entry_covariance = identification.covariance[first : first + 6, first : first + 6]
-    inverse = np.linalg.inv(parameters.inertia_derivatives(tensor))
+    inverse = np.linalg.inv(parameters.inertia_derivatives(pseudo_root(tensor)))
     sizes, directions = np.linalg.eigh(inverse @ entry_covariance @ inverse.T)
     upper: Any = np.linalg.qr((directions * np.sqrt(np.maximum(sizes, 0.0))).T, mode="r")
     lower = upper.T * np.where(np.diag(upper) < 0.0, -1.0, 1.0)
@@ -208,8 +210,12 @@ def innovations(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
 
 def verdict(identification: Identification) -> list[str]:
     """Return sentences that state whether the model explains each log, and which parameters are not determined."""
-    lines, dispersed = [], identification.problem.dispersed
-    advice = f"free {', '.join(dispersed)}, which [dispersion] varies" if dispersed else "free more parameters"
+    lines, problem = [], identification.problem
+    dispersed = ", ".join(problem.dispersed)
+    steps = [f"free {dispersed}, which [dispersion] varies" if dispersed else "free more parameters"]
+    if any(parameter.name == "inertia" and parameter.size == 3 for parameter in problem.parameters):
+        steps.append("set dispersion.inertia.axes_deg, without which the principal axes are those of the scenario")
+    advice = ", ".join(steps)
     for fit in [*identification.fits, *identification.validation]:
         name = f"{fit.log.name} (validation)" if fit in identification.validation else fit.log.name
         details = f"mean square {fit.mean_square:.3g} of its expected value"

@@ -293,6 +293,41 @@ def test_every_value_of_the_coordinates_is_the_inertia_of_a_body():
     np.testing.assert_allclose(numbers.from_coordinates(root, jnp.zeros(6)), np.diag([0.05, 0.09, 0.1399]), rtol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("moments", "dispersion"),
+    [
+        ([0.05, 0.09, 0.11], {"std": 0.03}),
+        ([0.05, 0.09, 0.11], {"std": 0.03, "axes_deg": 2.0}),
+        ([0.05, 0.09, 0.09], {"std": 0.05, "axes_deg": 5.0}),
+        ([[0.07, 0.02, 0.0], [0.02, 0.07, 0.0], [0.0, 0.0, 0.11]], {"std": 0.03}),
+        ([0.05, 0.09, 0.11], {"kind": "correlated"}),
+    ],
+)
+def test_the_prior_knowledge_of_the_inertia_is_that_of_its_dispersion(moments, dispersion):
+    """Regression: products of inertia were uncertain even if the dispersion keeps the principal axes."""
+    loaded = satellite(("inertia",), spacecraft={"inertia": moments}, dispersion={"inertia": dispersion})
+    loaded = scenario.replace(loaded, identify__prior="dispersion")
+    frame, _ = flight(np.random.default_rng(2))
+    problem = parameters.build(loaded, [telemetry.measurements(loaded, frame)])
+    ready = scenario.study(loaded)
+    draw = jax.jit(jax.vmap(lambda trial: ready.dispersion.apply(ready.parts, 0, trial).plant.inertia))
+    drawn = np.asarray(draw(jnp.arange(4000)))[:, *np.triu_indices(3)]
+    prior_std = np.linalg.norm(problem.derivatives(np.zeros(problem.size)), axis=1)
+    np.testing.assert_allclose(prior_std, np.std(drawn, axis=0), rtol=0.1, atol=1e-12)
+
+
+def test_principal_axes_without_a_dispersion_are_kept_and_the_verdict_names_them():
+    frame, _ = flight(np.random.default_rng(2), rate=(0.02, -0.01, 0.03))
+    loaded = satellite(identify={"free": ["inertia", "gyro_bias"]}, dispersion={"inertia": {"std": 0.3}})
+    found = explore.identify(loaded, frame)
+    products = [label in ("inertia_12", "inertia_13", "inertia_23") for label in found.problem.labels]
+    assert np.all(found.estimate[products] == 0.0)
+    assert np.all(found.std[products] == 0.0)
+    assert "axes_deg" in found.verdict[0]  # the log has products of inertia
+    written: Any = found.identified_scenario
+    np.testing.assert_array_equal(np.array(written.dispersion.inertia.matrix())[3:], 0.0)  # those of the products
+
+
 def test_the_variance_of_the_data_but_not_of_prior_knowledge_is_inflated():
     data, factor = np.array([1e-9, 0.5, 50.0, 1e4]), 100.0
     # variance of the mean of a measurement with variance factor / data and of prior knowledge with variance 1
