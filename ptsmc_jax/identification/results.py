@@ -14,6 +14,7 @@ from ptsmc_jax.scenario import parsing, reading
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.signals import disturbances
 
+FAR_FROM_PRIOR = 5.0  # distance of an estimate from its prior value that the verdict names, in sigmas of the prior
 MAX_STD = 0.3  # largest 1 sigma of a relative dispersion in a scenario
 
 
@@ -239,6 +240,27 @@ def verdict(identification: Identification) -> list[str]:
     if identification.variance_factor > 1.0:
         widening = float(np.sqrt(identification.variance_factor))
         lines.append(f"the intervals are up to {widening:.3g} times as wide as for white innovations")
+    lines += _far_estimates(identification)
     if not identification.converged:
         lines.append("the search did NOT converge; its estimates are preliminary")
     return [*lines, *identification.undetermined]
+
+
+def _far_estimates(identification: Identification) -> list[str]:
+    """Return a sentence on the estimates that are more than `FAR_FROM_PRIOR` sigmas of the prior from the scenario.
+
+    Phases are not compared, because every phase is equally likely.
+    """
+    changes, prior_std = np.abs(identification.estimate - identification.start), identification.prior_std
+    distances = np.divide(changes, prior_std, out=np.zeros_like(changes), where=prior_std > 0.0)
+    far = [
+        f"{label} ({distance:.3g})"
+        for label, distance in zip(identification.problem.labels, distances, strict=True)
+        if distance > FAR_FROM_PRIOR and not label.startswith(parameters.PHASE)
+    ]
+    if not far:
+        return []
+    return [
+        f"estimates are far from the scenario, in sigmas of [dispersion]: {', '.join(far)}; check the units and columns in "
+        "[telemetry], the units of the scenario, and its model"
+    ]

@@ -1,5 +1,6 @@
 """Estimates of `ptsmc identify` from logs of an independent simulation, and the identified scenario."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -97,6 +98,15 @@ def test_the_summary_is_complete(identified):
     assert summary["status"] == "identified"
     assert [row["parameter"] for row in summary["parameters"]] == found.problem.labels
     assert len(summary["logs"]) == len(summary["validation"]) == 1
+
+
+def test_the_verdict_names_estimates_far_from_their_prior_knowledge(identified):
+    found, _ = identified
+    prior_std = np.full(6, np.inf)
+    prior_std[3] = abs(found.estimate - found.start)[3] / 6.0
+    (sentence,) = set(results.verdict(replace(found, prior_std=prior_std))) - set(results.verdict(found))
+    assert "inertia_22 (6)" in sentence
+    assert results.verdict(replace(found, prior_std=2.0 * prior_std)) == results.verdict(found)
 
 
 def test_a_notebook_shows_the_verdict_the_estimates_and_the_figures_of_each_log(identified):
