@@ -371,7 +371,7 @@ class Search:
         for k in range(1, max_starts):
             if best.acceleration_noise == 0.0 and best.mean_square < self.largest_mean_square:
                 break
-            self.report(f"the fit is poor; starting point {k + 1}")
+            self.report(f"starting point {k + 1} of {max_starts}")
             other = self.search_locally(draws.standard_normal(self.problem.size), acceleration)
             if _more_likely(best, other) is other:
                 best = self._mirror_phases(other)
@@ -425,7 +425,7 @@ class Search:
         accepted, highest = None, -np.inf
         for factor in (*ACCELERATION_NOISES, 0.0):
             self.acceleration_noise = factor * acceleration
-            self.report(f"the fit is poor: acceleration noise {self.acceleration_noise:.2g} rad/s^1.5 in the filter")
+            self.report(f"acceleration noise of the filter {self.acceleration_noise:.2g} rad/s^1.5")
             result = self._screen_and_maximise(z, 1, NOISY_TOLERANCE) if factor else self._screen_and_maximise(z)
             highest = max(highest, result.log_likelihood)
             if accepted is not None and result.log_likelihood < highest - NOISE_GAIN:

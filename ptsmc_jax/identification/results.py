@@ -261,6 +261,6 @@ def _far_estimates(identification: Identification) -> list[str]:
     if not far:
         return []
     return [
-        f"estimates are far from the scenario, in sigmas of [dispersion]: {', '.join(far)}; check the units and columns in "
-        "[telemetry], the units of the scenario, and its model"
+        f"estimates are far from the scenario, in sigmas of [dispersion]: {', '.join(far)}; check the units and "
+        "columns in [telemetry], the units of the scenario, and its model"
     ]
