@@ -31,8 +31,8 @@ def identification_figures(identification: Identification) -> dict[str, Figure]:
         units, factors = zip(*(UNITS.get(name.split("_")[0], ("", 1.0)) for name in names), strict=True)
         labels = [style.with_unit(name, unit) for name, unit in zip(names, units, strict=True)]
         figures[f"innovations{suffix}"] = innovations(t, labels, values * factors, sigma * factors)
-        counts = np.sum(np.isfinite(values), axis=0)
-        figures[f"autocorrelation{suffix}"] = autocorrelation(names, fit.autocorrelation(), counts)
+        limits = fit.autocorrelation_limits
+        figures[f"autocorrelation{suffix}"] = autocorrelation(names, fit.autocorrelation(), limits)
         figures[f"prediction{suffix}"] = signals(t, _predictions(fit, values))
     return figures
 
@@ -129,20 +129,20 @@ def innovations(t: np.ndarray, names: list[str], values: np.ndarray, sigma: np.n
 
 
 @style.styled
-def autocorrelation(names: list[str], values: np.ndarray, counts: np.ndarray) -> Figure:
-    """Draw the autocorrelation of the whitened innovations with its 95 % band.
+def autocorrelation(names: list[str], values: np.ndarray, limits: np.ndarray) -> Figure:
+    """Draw the autocorrelation of the whitened innovations with the band inside which they count as white.
 
     Args:
         names: names of the components.
         values: (lags, components) [-].
-        counts: number of readings of each component.
+        limits: largest autocorrelation of each component that counts as white, (components,) [-].
     """
     labels = [f"{name} [-]" for name in names]
-    figure, axes = _panels(labels, "Autocorrelation of the innovations and its 95 % band", "lag [readings]")
+    title = "Autocorrelation of the innovations; white innovations are inside the band"
+    figure, axes = _panels(labels, title, "lag [readings]")
     lags = np.arange(1, len(values) + 1)
     for k, panel in enumerate(axes):
-        half_width = 1.96 / np.sqrt(max(counts[k], 1))
-        panel.axhspan(-half_width, half_width, color="0.9")
+        panel.axhspan(-limits[k], limits[k], color="0.9")
         panel.vlines(lags, 0.0, values[:, k], color=style.STYLES[0][0])
     return figure
 

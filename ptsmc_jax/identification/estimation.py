@@ -128,6 +128,12 @@ class Fit:
         return np.stack([autocorrelate(column[np.isfinite(column)]) for column in self.whitened.T], axis=1)
 
     @property
+    def autocorrelation_limits(self) -> np.ndarray:
+        """The largest autocorrelation of each component that counts as white, (components,) [-]."""
+        readings = np.maximum(np.sum(np.isfinite(self.whitened), axis=0), 1)
+        return np.maximum(MAX_AUTOCORRELATION, MISFIT_SIGMAS / np.sqrt(readings))
+
+    @property
     def is_white(self) -> bool:
         """Whether the innovations fit their variance and are uncorrelated in time.
 
@@ -135,11 +141,10 @@ class Fit:
         the estimates, see `MAX_DISTANCE`. About 1 % of logs fail even with a correct model, because LAGS
         autocorrelations of each component are tested.
         """
-        readings = np.maximum(np.sum(np.isfinite(self.whitened), axis=0), 1)
-        bound = np.maximum(MAX_AUTOCORRELATION, MISFIT_SIGMAS / np.sqrt(readings))
-        low, high = _mean_square_range(int(np.sum(readings)))
+        low, high = _mean_square_range(int(np.sum(np.isfinite(self.whitened))))
         is_consistent = low < self.mean_square < high and self.acceleration_noise == 0.0
-        return is_consistent and self.distance < MAX_DISTANCE and bool(np.all(np.abs(self.autocorrelation()) < bound))
+        is_uncorrelated = np.all(np.abs(self.autocorrelation()) < self.autocorrelation_limits)
+        return is_consistent and self.distance < MAX_DISTANCE and bool(is_uncorrelated)
 
 
 @dataclass(frozen=True, eq=False)

@@ -122,6 +122,14 @@ def test_a_notebook_shows_the_verdict_the_estimates_and_the_figures_of_each_log(
     np.testing.assert_allclose(np.asarray(axes.lines[0].get_ydata())[0], np.rad2deg(first) * 3600.0, rtol=1e-12)
 
 
+def test_the_figure_of_the_autocorrelation_has_the_limit_of_the_verdict(identified):
+    found, _ = identified
+    (band,) = found.plot("autocorrelation")["autocorrelation"].axes[0].patches
+    readings = np.sum(np.isfinite(found.fits[0].whitened[:, 0]))
+    limit = max(estimation.MAX_AUTOCORRELATION, estimation.MISFIT_SIGMAS / np.sqrt(readings))
+    np.testing.assert_allclose((band.get_y(), band.get_height()), (-limit, 2.0 * limit))
+
+
 def test_innovations_of_the_attitude_are_drawn_in_arcsec(identified):
     found, _ = identified
     panels = found.plot("innovations")["innovations"].axes
