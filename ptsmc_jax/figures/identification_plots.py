@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from ptsmc_jax.figures import style
 from ptsmc_jax.formulas import ARCSEC
-from ptsmc_jax.identification import results
+from ptsmc_jax.identification import parameters, results
 from ptsmc_jax.identification.estimation import Fit, Identification
 
 if TYPE_CHECKING:
@@ -151,7 +151,8 @@ def autocorrelation(names: list[str], values: np.ndarray, limits: np.ndarray) ->
 def estimates(table: "DataFrame") -> Figure:
     """Draw the change of each number, relative to the largest number of its parameter, with its 95 % interval.
 
-    The prior interval is drawn beside it in grey. `table` is that of `Identification.table`.
+    The prior interval is drawn beside it in grey. The prior knowledge of a phase is that it is uniform over the circle.
+    `table` is that of `Identification.table`.
     """
     rows = list(table.iter_rows(named=True))
     figure = Figure(figsize=(8.0, 1.2 + 0.4 * len(rows)), layout="constrained")
@@ -165,7 +166,9 @@ def estimates(table: "DataFrame") -> Figure:
         size = max(max(abs(other["start"]), abs(other["estimate"])) for other in same_parameter) or 1.0
         change, half_width = 100.0 * (row["estimate"] - row["start"]) / size, 196.0 * row["std"] / size
         if np.isfinite(row["prior_std"]):
-            axes.errorbar(0.0, k + 0.2, xerr=196.0 * row["prior_std"] / size, color="0.6", capsize=3, fmt="o", ms=3)
+            is_phase = row["parameter"].startswith(parameters.PHASE)
+            prior_half_width = 100.0 * (np.pi if is_phase else 1.96 * row["prior_std"]) / size
+            axes.errorbar(0.0, k + 0.2, xerr=prior_half_width, color="0.6", capsize=3, fmt="o", ms=3)
         axes.errorbar(change, k, xerr=half_width, color=style.STYLES[0][0], capsize=3, fmt="o", ms=4)
     axes.set_yticks(range(len(rows)), [row["parameter"] for row in rows])
     axes.invert_yaxis()

@@ -1,6 +1,9 @@
 """Content of identification figures, read from their axes."""
 
+from typing import Any
+
 import numpy as np
+import polars as pl
 
 from ptsmc_jax.figures import identification_plots
 
@@ -32,3 +35,16 @@ def test_rejected_readings_are_crosses():
 def test_a_proposed_manoeuvre_names_its_components():
     figure = identification_plots.profile(np.arange(5.0), [("command [N m]", np.ones((5, 3)))])
     assert [text.get_text() for text in figure.legends[0].get_texts()] == [f"component {k}" for k in (1, 2, 3)]
+
+
+def test_the_prior_interval_of_a_uniform_phase_is_the_circle():
+    row = {
+        "parameter": "disturbance_phase",
+        "estimate": 2.0,
+        "start": 0.0,
+        "std": 0.1,
+        "prior_std": np.pi / np.sqrt(3.0),
+    }
+    axes: Any = identification_plots.estimates(pl.DataFrame([row])).axes[0]
+    bars = [container.lines[2][0].get_segments()[0][:, 0] for container in axes.containers]
+    np.testing.assert_allclose(bars, [[-50.0 * np.pi, 50.0 * np.pi], [90.2, 109.8]])

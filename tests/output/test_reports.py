@@ -403,13 +403,22 @@ def quantiles_of_angles() -> list[Table]:
 
 
 def identified(**changes: Any) -> Report:
-    """Return the report of an identified angle, and of a time without prior knowledge."""
+    """Return the report of an identified angle, of a uniform phase, and of a time without prior knowledge."""
     angle = {"parameter": "attitude_noise", "estimate": 5e-5, "std": 1e-6, "lower": 4.8e-5, "upper": 5.2e-5,
              "start": 4e-5, "prior_std": 2e-5, "unit": "rad"}  # fmt: skip
     lag = {"parameter": "torque_lag", "estimate": 0.05, "std": 0.01, "lower": 0.03, "upper": 0.07, "start": 0.04,
            "prior_std": math.inf, "unit": "s"}  # fmt: skip
-    results = {"parameters": [angle, lag], "gyro_bias": [], "logs": [], "validation": [], "verdict": [], **changes}
-    return reports.build("identify", {"status": "identified", **results}, "spacecraft")
+    phase = {"parameter": "disturbance_phase_1", "estimate": 2.1, "std": 0.02, "lower": 2.06, "upper": 2.14,
+             "start": 0.0, "prior_std": math.pi / math.sqrt(3.0), "unit": "rad"}  # fmt: skip
+    results = {
+        "parameters": [angle, phase, lag],
+        "gyro_bias": [],
+        "logs": [],
+        "validation": [],
+        "verdict": [],
+        **changes,
+    }
+    return reports.build("identify", {"status": "identified", **results, **changes}, "spacecraft")
 
 
 def approach(judged: bool) -> Report:

@@ -127,15 +127,18 @@ def identify_report(summary: Mapping[str, Any]) -> Report:
     for one in summary["parameters"]:
         unit, numbers = in_readable_unit(one["parameter"], one["unit"], *(one[column] for column in columns))
         estimate, std, lower, upper, start, prior_std = numbers
+        prior = format_number(prior_std, ".3g", "none")
+        if one["parameter"].startswith("disturbance_phase") and one["prior_std"] is not None:
+            prior = "uniform"  # over the circle, the only dispersion of a phase
         estimates.append((
-            one["parameter"], f"{estimate:.6g}", f"{std:.2g}", f"{lower:.5g} to {upper:.5g}", f"{start:.6g}",
-            format_number(prior_std, ".2g", "none"), unit or "-",
+            one["parameter"], f"{estimate:.6g}", f"{std:.3g}", f"{lower:.5g} to {upper:.5g}", f"{start:.6g}", prior,
+            unit or "-",
         ))  # fmt: skip
     for bias in summary["gyro_bias"]:
         for axis, value, std in zip("xyz", bias["estimate"], bias["std"], strict=True):
             name = f"gyro bias {axis} at the end of {bias['log']}"
             interval = f"{value - 1.96 * std:.5g} to {value + 1.96 * std:.5g}"
-            estimates.append((name, f"{value:.6g}", f"{std:.2g}", interval, "-", "-", "rad/s"))
+            estimates.append((name, f"{value:.6g}", f"{std:.3g}", interval, "-", "-", "rad/s"))
     estimate_head = ("parameter", "estimate", "1 sigma", "95 % interval", "scenario", "prior 1 sigma", "unit")
     logs = []
     for use, fits in (("estimation", summary["logs"]), ("validation", summary["validation"])):
