@@ -452,7 +452,23 @@ class Search:
             previous_masks, result = masks, self.maximise_likelihood(z, logs, tolerance)
             z = result.z
         assert result is not None
-        return result
+        if not np.isfinite(result.log_likelihood):
+            return result
+        return result._replace(log_likelihood=self.log_likelihood(z))
+
+    def log_likelihood(self, z: np.ndarray) -> float:
+        """Return the log-likelihood of all readings and the prior, with a limited cost of outliers.
+
+        A rejected reading counts as one at the limit of its screening. Results that reject different readings are
+        therefore comparable.
+        """
+        log_likelihood = -0.5 * float(np.sum(self.prior_weight * z**2))
+        for log in self.logs:
+            innovations, limit = self._screen(z, log)
+            squares = np.where(innovations.accepted, innovations.value**2 / innovations.variance, limit)
+            squares = np.where(log[0].valid[1:], squares, 0.0)
+            log_likelihood -= 0.5 * float(np.sum(squares + np.log(innovations.variance)))
+        return log_likelihood
 
     @staticmethod
     def _relative_median(innovations: Innovations) -> float:
@@ -467,13 +483,22 @@ class Search:
         model cannot reject most of the correct readings.
         """
         rows, kind = log
-        accepted = valid = rows.valid[1:]
+        return rows._replace(valid=np.concatenate([rows.valid[:1], self._screen(z, log)[0].accepted])), kind
+
+    def _screen(self, z: np.ndarray, log: PreparedLog) -> tuple[Innovations, float]:
+        """Return the innovations of a log, and the limit of the mean normalised square of accepted readings.
+
+        See `reject_outliers`.
+        """
+        valid = log[0].valid[1:]
         largest_count = np.maximum(MIN_OUTLIERS, MAX_OUTLIER_FRACTION * np.sum(valid, axis=0))
-        for growth in GATE_GROWTHS:
-            accepted = self.innovations(z, log, growth * self.gate).accepted
-            if np.all(np.sum(valid & ~accepted, axis=0) <= largest_count):
+        limit, innovations = np.inf, None
+        for limit in self.gate * np.array(GATE_GROWTHS):
+            innovations = self.innovations(z, log, limit)
+            if np.all(np.sum(valid & ~innovations.accepted, axis=0) <= largest_count):
                 break
-        return rows._replace(valid=np.concatenate([rows.valid[:1], accepted])), kind
+        assert innovations is not None
+        return innovations, limit
 
     def maximise_likelihood(self, z: np.ndarray, logs: Sequence[PreparedLog], tolerance: float) -> SearchResult:
         """Return the result of a local search from z for the most likely parameters of these logs and the prior.

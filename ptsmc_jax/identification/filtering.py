@@ -66,7 +66,7 @@ class Rows(NamedTuple):
 
 
 class Innovations(NamedTuple):
-    """Prediction errors of all rows but the first, (rows - 1, components)."""
+    """Prediction errors of all rows but the first, (rows - 1, components); 0 with variance 1 without a reading."""
 
     value: Any  # reading minus prediction, given the readings before and the components before in this row
     variance: Any
@@ -357,12 +357,9 @@ def _correct(
     state_correction, bias_correction, walk_correction = jnp.split(correction, [n, n + carry.bias.size])
     x = model.plant.normalise(model.plant.retract(carry.x, state_correction))
     corrected = carry._replace(x=x, bias=carry.bias + bias_correction, walk=carry.walk + walk_correction, covariance=p)
-    accepted = jnp.stack(accepted_components)
-    # missing and rejected readings have an innovation of 0 with variance 1, so that they do not change the likelihood
-    errors = Innovations(
-        jnp.where(accepted, jnp.stack(values), 0.0), jnp.where(accepted, jnp.stack(variances), 1.0), accepted
-    )
-    return corrected, errors
+    # missing readings have an innovation of 0 with variance 1, so that they do not change the likelihood
+    value, variance = jnp.where(valid, jnp.stack(values), 0.0), jnp.where(valid, jnp.stack(variances), 1.0)
+    return corrected, Innovations(value, variance, jnp.stack(accepted_components))
 
 
 def _compute_residuals(model: Model, carry: FilterState, readings: dict[str, Array]) -> tuple[Array, Array, Array]:

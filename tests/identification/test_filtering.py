@@ -134,6 +134,22 @@ def test_the_gradient_of_the_likelihood_agrees_with_finite_differences():
     assert np.linalg.eigvalsh(information)[0] > 0.0
 
 
+def test_the_likelihood_does_not_jump_if_a_reading_is_rejected():
+    """Regression: a rejected reading did not count, and the gain or loss depended on the unit of the readings."""
+    problem, (rows, kind) = prepared(chain(["actuator_scale"]), chain_log(bias=0.0)[0])
+    last = np.flatnonzero(rows.valid[:, 1])[-1]
+    found = estimation.Search(problem, [(rows, kind)], 30.0, lambda text: None).innovations(np.zeros(1), (rows, kind))
+    likelihoods = []
+    for size in (0.999, 1.001):
+        x = rows.readings["x"].copy()
+        x[last, 1] += size * np.sqrt(30.0 * found.variance[last - 1, 1]) - found.value[last - 1, 1]
+        search = estimation.Search(problem, [(rows._replace(readings={"x": x}), kind)], 30.0, lambda text: None)
+        rejected = rows.valid[1:] & ~search.reject_outliers(np.zeros(1), search.logs[0])[0].valid[1:]
+        assert rejected.sum() == (size > 1.0)
+        likelihoods.append(search.log_likelihood(np.zeros(1)))
+    assert likelihoods[1] == pytest.approx(likelihoods[0], abs=0.1)
+
+
 def test_derivatives_without_those_of_the_covariance_are_good_enough_for_a_first_search():
     rng = np.random.default_rng(3)
     inertia = np.array([[0.05, 0.002, -0.001], [0.002, 0.09, 0.003], [-0.001, 0.003, 0.11]])
