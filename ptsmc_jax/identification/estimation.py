@@ -58,6 +58,19 @@ def _mean_square_range(count: int) -> tuple[float, float]:
     return min(MEAN_SQUARE_RANGE[0], 1.0 - spread), max(MEAN_SQUARE_RANGE[1], 1.0 + spread)
 
 
+def _sum_autocovariance(values: np.ndarray) -> float:
+    """Return the sum of the autocovariance of values (n,) with mean zero over all lags.
+
+    The sum ends before the first negative sum of two successive lags, because noise dominates later lags (initial
+    positive sequence, Geyer, Statistical Science 7(4), 1992).
+    """
+    spectrum = np.abs(np.fft.rfft(values, 2 * values.size)) ** 2
+    autocovariance = np.fft.irfft(spectrum)[: values.size] / values.size
+    pairs = autocovariance[: values.size // 2 * 2].reshape(-1, 2).sum(axis=1)
+    count = int(np.argmax(pairs < 0.0)) if np.any(pairs < 0.0) else pairs.size
+    return float(2.0 * np.sum(pairs[:count]) - autocovariance[0])
+
+
 @dataclass(frozen=True, eq=False)
 class Fit:
     """Innovations of a log for estimated parameters.
@@ -110,8 +123,8 @@ class Fit:
         """
         if self.is_white:
             return 1.0
-        squares = np.nansum(self.whitened**2, axis=0) / np.maximum(np.sum(np.isfinite(self.whitened), axis=0), 1)
-        return max(1.0, float(np.max(squares * (1.0 + 2.0 * np.sum(self.autocorrelation(), axis=0)))))
+        columns = [column[np.isfinite(column)] for column in self.whitened.T]
+        return max(1.0, *(_sum_autocovariance(column) for column in columns if column.size))
 
     def autocorrelation(self) -> np.ndarray:
         """Return the autocorrelation (LAGS, components) [-] of the whitened innovations at the lags 1, 2, ..
