@@ -87,6 +87,7 @@ class Problem:
     max_step: float  # longest integration step [s]
     has_gyro_bias: bool  # whether the gyro bias is estimated
     dispersed: tuple[str, ...] = ()  # parameters that [dispersion] varies, but that are not free
+    unknown_noises: tuple[str, ...] = ()  # noises without a value in the scenario, whose start is an estimate
 
     @property
     def size(self) -> int:
@@ -198,7 +199,7 @@ def build(scenario: Scenario, logs: Sequence[Measurements], names: Sequence[str]
     max_step = min(interval * 1.5, 0.2 / max(fastest, 1e-12), 0.1 / max(rate, 1e-12))
     others = possible.keys() - {parameter.name for parameter in selected}
     dispersed = sorted(name for name in others if getattr(scenario.dispersion, name, None) is not None)
-    return Problem(model, selected, max_step, with_bias, tuple(dispersed))
+    return Problem(model, selected, max_step, with_bias, tuple(dispersed), tuple(unknown_noises))
 
 
 def _build_model(

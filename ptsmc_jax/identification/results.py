@@ -240,10 +240,27 @@ def verdict(identification: Identification) -> list[str]:
     if identification.variance_factor > 1.0:
         widening = float(np.sqrt(identification.variance_factor))
         lines.append(f"the intervals are up to {widening:.3g} times as wide as for white innovations")
-    lines += _far_estimates(identification)
+    lines += [*_noise_ratios(identification), *_far_estimates(identification)]
     if not identification.converged:
         lines.append("the search did NOT converge; its estimates are preliminary")
     return [*lines, *identification.undetermined]
+
+
+def _noise_ratios(identification: Identification) -> list[str]:
+    """Return a sentence with the ratio of each estimated noise to that of the scenario.
+
+    Innovations always fit an estimated noise, and the verdict does not detect an error of the scenario's value.
+    """
+    problem = identification.problem
+    names = [one.name for one in problem.parameters for _ in one.labels]
+    ratios = [
+        f"{label} {estimate / start:.3g}"
+        for name, label, estimate, start in zip(
+            names, problem.labels, identification.estimate, identification.start, strict=True
+        )
+        if name.endswith("_noise") and name not in problem.unknown_noises
+    ]
+    return [f"estimated noise over that of the scenario: {', '.join(ratios)}"] if ratios else []
 
 
 def _far_estimates(identification: Identification) -> list[str]:

@@ -112,6 +112,18 @@ def test_a_linear_gaussian_estimate_is_that_of_generalised_least_squares():
     assert found.is_identified
 
 
+@pytest.mark.parametrize(("hardware", "sentences"), [({"state_noise": [4e-3, 5e-3]}, 1), ({}, 0)])
+def test_the_verdict_states_the_ratio_of_an_estimated_noise_to_that_of_the_scenario(hardware, sentences):
+    """The innovations fit an estimated noise. Without a noise in the scenario, there is nothing to compare."""
+    loaded = scenario.replace(chain(["disturbance_bias", "state_noise"]), hardware=hardware)
+    found = explore.identify(loaded, chain_log()[0])
+    lines = [line for line in found.verdict if "estimated noise over that of the scenario" in line]
+    assert len(lines) == sentences
+    ratio = found.estimate[found.problem.labels.index("state_noise_1")] / 4e-3
+    assert all(f"state_noise_1 {ratio:.3g}, state_noise_2 " in line for line in lines)
+    assert abs(ratio - 0.5) < 0.2
+
+
 def test_the_gradient_of_the_likelihood_agrees_with_finite_differences():
     frame, *_ = chain_log(scale=1.1)
     names = ["actuator_scale", "state_noise", "disturbance_bias", "delay"]
