@@ -37,7 +37,7 @@ DISPERSION = {
 
 def enlarged(parts):
     """Return parts with more periods and integration steps, so that several runs use one compiled program."""
-    return replace(parts, clock=replace(parts.clock, after=64), substeps=30)
+    return replace(parts, clock=replace(parts.clock, count=84), substeps=30)
 
 
 @pytest.fixture(scope="module")

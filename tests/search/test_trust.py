@@ -26,7 +26,7 @@ BOUNDS = Bounds(("eta", "delta", "t_f"), (2.5, 0.3, 15.0), (5.0, 4.0, 25.0))
 def moved_in_time(**limits):
     """Return a double integrator with noise. Its clock covers all of `BOUNDS`, so that tests share one program."""
     noisy = problem(**limits)
-    far = replace(noisy.parts, clock=clock.anchored_clock(0.2, 21.0))
+    far = replace(noisy.parts, clock=replace(clock.anchored_clock(0.2, 21.0), count=140))
     return replace(noisy, parts=far, names=BOUNDS.names)
 
 

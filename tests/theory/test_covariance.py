@@ -146,7 +146,7 @@ def test_filter_covariance_stays_at_its_initial_steady_state():
     p = state.start()
     begun, sizes = np.sqrt(np.diag(known @ p @ known.T)), []
     np.testing.assert_allclose(np.sqrt(np.diag(p)[state._sensor_states]), 1e-5, rtol=1e-12)
-    for j, length in enumerate(ticks.t_next - ticks.t):
+    for j, length in enumerate((ticks.t_next - ticks.t)[:60]):
         p = moved.in_period(j).covariance(p) + np.diag((state.drift * length) ** 2)
         sizes.append(np.sqrt(np.diag(known @ p @ known.T)))
     np.testing.assert_allclose(np.asarray(sizes) / begun, 1.0, atol=0.15)
