@@ -199,11 +199,14 @@ DRAWN = {
 
 
 def posed_of(plant):
-    """Return the tuning problem of this plant with its dispersions."""
+    """Return the tuning problem of this plant with its dispersions, and with the hardest trials for its gains."""
     tables = DRAWN[plant]
-    return posing.set_up_tuning(
+    posed = posing.set_up_tuning(
         scenario.from_tables({**tables, "requirements": {**tables["requirements"], "peak_torque": 5.0}}), 3
     )
+    assert posed.problem.margins is not None
+    hardest, _ = margin_rows.select_hardest_trials(posed.problem.margins, posed.scenario_gains)
+    return dataclasses.replace(posed, problem=dataclasses.replace(posed.problem, margins=hardest))
 
 
 @pytest.fixture(scope="module", params=short(DRAWN, ["chain"]))
@@ -265,8 +268,8 @@ def test_margin_gradients_with_dispersed_inertia_compile_if_delta_is_free():
         "import numpy as np; from ptsmc_jax import scenario\n"
         "from tuning.search import margin_rows; from tuning.search.normalisation import bounds_of_scenario\n"
         f"known = scenario.replace(scenario.read({str(FIRST_FLIGHT)!r}), **{changes!r})\n"
-        "margin_rows.select_hardest_trials = lambda asked, _: (margin_rows._with_trials(asked, np.arange(2)), 0.0)\n"
         "ready = scenario.study(known); bounds = bounds_of_scenario(known, ready.parts)\n"
+        "margin_rows.CASES = 2\n"
         "asked = margin_rows.build_required_margins(ready, bounds, 0)\n"
         "found = margin_rows.constraints_at_points(asked, bounds.scale, np.full((1, len(bounds.names)), 0.5))\n"
         "print(found['c_gradient'].shape)"
@@ -292,7 +295,6 @@ def test_evaluator_appends_constraints_on_the_worst_margins_of_all_trials(drawn,
     assert len(np.unique(each["gain_margin"])) == TRIALS
     # with other gains, other trials are the hardest and become the constraints
     asked = posed.problem.margins
-    assert asked is not None
     other = posed.scenario_gains * np.asarray([1.0, 0.2, 1.0, 1.0])  # a slow observer
     parts = with_gains(asked.parts, dict(zip(asked.names, other, strict=True)))
     each = worst_of(all_of(parts, asked.dispersion, 3))
@@ -307,7 +309,6 @@ def test_evaluator_appends_constraints_on_the_worst_margins_of_all_trials(drawn,
 
 def test_prepared_margin_program_is_the_program_of_the_search(drawn, monkeypatch):
     """A program with other shapes or types would be compiled in vain."""
-    monkeypatch.setattr(margin_rows, "select_hardest_trials", lambda asked, _: (asked, 0.0))
     bounds = drawn.evaluate.bounds
     points = np.stack([bounds.normalise(drawn.scenario_gains)] * len(jax.local_devices()))
     assert_prepared(

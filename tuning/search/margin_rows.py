@@ -25,7 +25,6 @@ from ptsmc_jax.simulation.catalogues import MARGINS
 from ptsmc_jax.simulation.requirements import violation_ratio
 from ptsmc_jax.theory import linear, margins, run_margins
 from ptsmc_jax.theory.linear import Loop
-from tuning.search import gains as gain_names
 from tuning.search.gains import with_gains
 from tuning.search.normalisation import Bounds, Scale
 
@@ -55,9 +54,8 @@ class RequiredMargins:
 def build_required_margins(ready: Study, bounds: Bounds, seed: int) -> RequiredMargins | None:
     """Return the margins that a scenario requires, or None if it requires none.
 
-    If dispersions change the loop, the constrained loops are those of the worst trials for the scenario's gains. The
-    program that computes the constraints is compiled in parallel with the program that finds these trials. Each
-    compilation takes as long as a search.
+    If dispersions change the loop, the constrained loops are those of the first trials, until `select_hardest_trials`
+    selects others. The programs of both are compiled in the background.
 
     Args:
         ready: the scenario with its parts.
@@ -76,9 +74,11 @@ def build_required_margins(ready: Study, bounds: Bounds, seed: int) -> RequiredM
         metrics=tuple(one.metric for one in ready.margins),
         names=bounds.names,
     )
-    example = _with_trials(asked, np.arange(CASES)) if margin_verdicts.has_different_loops(asked.dispersion) else asked
-    constraints_on_devices.prepare(example, bounds.scale, np.zeros((len(configure.processors()), len(bounds.names))))
-    return select_hardest_trials(asked, np.asarray(gain_names.present_values(ready.parts, bounds.names)))[0]
+    if margin_verdicts.has_different_loops(asked.dispersion):
+        asked = _with_trials(asked, np.arange(CASES))
+        margin_verdicts.prepare(ready)
+    constraints_on_devices.prepare(asked, bounds.scale, np.zeros((len(configure.processors()), len(bounds.names))))
+    return asked
 
 
 def _with_trials(asked: RequiredMargins, trials: np.ndarray) -> RequiredMargins:
