@@ -233,7 +233,7 @@ class CubesatProgram:
         out = np.zeros((len(trials), len(CUBESAT_METRICS) + self.pointing * len(POINTING_METRICS)))
 
         def simulate() -> np.ndarray:
-            self.library.fly_cubesat(at(constants), at(rows), len(rows), at(drawn), at(keys), len(trials), at(out))
+            self.library.simulate_cubesat(at(constants), at(rows), len(rows), at(drawn), at(keys), len(trials), at(out))
             return out
 
         return simulate

@@ -705,7 +705,7 @@ SMALL void begin(const Mission *s, Flight *z, const Trial *trials, const uint32_
 
 /* trials: a multiple of LANES; keys: (trials, 6) of attitude noise, rate noise and bias walk; out: (trials, columns) in
  * the order of `common.CUBESAT_METRICS`, then 28 pointing indices if there are. */
-void fly_cubesat(const Mission *s, const Tick *ticks, int steps, const Trial *drawn, const uint32_t *keys, int trials,
+void simulate_cubesat(const Mission *s, const Tick *ticks, int steps, const Trial *drawn, const uint32_t *keys, int trials,
                  real *out) {
     const int columns = 16 + 28 * POINTING;
 #if POINTING

@@ -233,7 +233,7 @@ SMALL void disturbance(const Study *s, real t, real *d) {
 /* trials: a multiple of LANES. q0: (trials, 4); out: (trials, 1) or, with METRICS, (trials, 12): peak_torque,
  * terminal_error, terminal_angle, window_error, hold_error, effort, settling_time, chattering, peak_rate,
  * peak_momentum, status, bad_time. nodes: (steps + 1,) times. */
-void fly(const Study *s, const real *nodes, int steps, const real *q0, int trials, real *out) {
+void simulate(const Study *s, const real *nodes, int steps, const real *q0, int trials, real *out) {
     const int columns = METRICS ? 12 : 1;
 #pragma omp parallel for schedule(static)
     for (int block = 0; block < trials / LANES; block++) {
