@@ -198,6 +198,25 @@ def evaluated_at(some, *gains):
     return found.f[0], found.c[0], found.value[0]
 
 
+def test_repeated_trials_are_simulated_and_counted_once():
+    """Slots repeat the first trial. The same trial with other random numbers is another trial."""
+    once = problem(3)
+    last = {name: np.concatenate([v, v[:1], 1.1 * v[:1]]) for name, v in once.coordinates.items()}
+    repeated = replace(objective.with_trials(once, np.array([0, 0])), coordinates=last)
+    batch, places = repeated.batch.distinct()
+    assert (batch.trials.tolist(), places.tolist()) == ([0, 1, 2, 0], [0, 1, 2, 0, 3])
+    normalised = WITHIN.normalise(np.asarray([3.1, 0.6]))[None]
+    evaluate, alone = Evaluator(WITHIN), Evaluator(WITHIN)
+    many, few = (each.measure_with_gradients(some, normalised) for each, some in ((evaluate, repeated), (alone, once)))
+    for name in ("c", "c_gradient"):
+        values, expected = getattr(many, name), getattr(few, name)
+        np.testing.assert_array_equal(values[:, :, :3], expected)
+        np.testing.assert_array_equal(values[:, :, 3], values[:, :, 0])
+        assert np.any(values[:, :, 4] != values[:, :, 0])
+    np.testing.assert_array_equal(evaluate.measure(repeated, normalised).c, many.c)
+    assert (evaluate.gradients, evaluate.rollouts, alone.gradients) == (4, 4, 3)
+
+
 def simulated_at(some, trials, *gains):
     """Return the metrics of these trials."""
     return simulations.simulate_trials(some.batch_of(np.asarray(trials)), np.asarray(gains)).metrics
@@ -382,7 +401,7 @@ def test_search_agrees_with_a_brute_force_scan(monkeypatch):
     alone = [told for told in seen if told[0].endswith(" local search")]  # one search, so there is nothing to count
     assert {told[:3] for told in alone} == {("first local search", 0, 0), ("last local search", 0, 0)}
     # 64 Sobol points, two screenings of 16 trials, and at least one attempt with other hand-overs
-    swept = (evaluate.rollouts - 2 * 16) / found.problem.trials.size
+    swept = (evaluate.rollouts - 2 * 16) / len(found.problem.batch.distinct()[0].trials)
     assert 64 < swept <= 64 + local_searches.HAND_OVER_ATTEMPTS * hand_overs.OTHER_HAND_OVERS
     # Upper limit of the gradients. The scenario's gains: half of the steps twice, and one point for active limits. Each
     # starting point: half of the steps twice. The best one: all steps. Then other hand-overs, the final search, two

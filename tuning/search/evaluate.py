@@ -76,7 +76,7 @@ class Evaluator:
 
     def measure(self, problem: Problem, normalised: np.ndarray) -> Measurement:
         """Return F, constraints and objective at points, (points, gains) normalised gains."""
-        self.rollouts += len(normalised) * problem.trials.size
+        self.rollouts += len(normalised) * len(problem.batch.distinct()[0].trials)
         return Measurement(**self._answer(problem, normalised, with_gradients=False))
 
     def measure_with_gradients(self, problem: Problem, normalised: np.ndarray) -> MeasurementWithGradients:
@@ -89,7 +89,7 @@ class Evaluator:
             self._known_problem, self._known = encoded, {}
         new = [k for k, key in enumerate(keys) if key not in self._known]
         if new:
-            self.gradients += len(new) * problem.trials.size
+            self.gradients += len(new) * len(problem.batch.distinct()[0].trials)
             measured = MeasurementWithGradients(**self._answer(problem, normalised[new], with_gradients=True))
             self._known |= {keys[k]: measured.at(place) for place, k in enumerate(new)}
         known = [vars(self._known[key]) for key in keys]

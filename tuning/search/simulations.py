@@ -44,6 +44,19 @@ class Batch(NamedTuple):
         """Arguments with trials on the first axis."""
         return {"trial": self.trials, "coordinates": dict(self.coordinates)}
 
+    def distinct(self) -> tuple["Batch", np.ndarray]:
+        """Return the batch without repeated trials, and the index of each trial of this batch in it, (trials,).
+
+        Slots of a problem repeat its first trial until other trials join, see `rounds`.
+        """
+        columns = [np.asarray(self.trials), *self.coordinates.values()]
+        rows = np.concatenate([np.asarray(v, dtype=float).reshape(len(self.trials), -1) for v in columns], axis=1)
+        _, first, places = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+        order = np.argsort(first)  # in the order of this batch
+        coordinates = {name: np.asarray(v)[first[order]] for name, v in self.coordinates.items()}
+        distinct = self._replace(trials=np.asarray(self.trials)[first[order]], coordinates=coordinates)
+        return distinct, np.argsort(order)[places.ravel()]
+
     @property
     def shared(self) -> tuple[Parts, Dispersion, jax.Array]:
         """Arguments that all trials share."""
@@ -65,10 +78,12 @@ def differentiable_dispersions(dispersion: Dispersion) -> tuple[str, ...]:
 
 def simulate(batch: Batch, gains: np.ndarray) -> Simulated:
     """Simulate the trials at every point of gains, (points, gains). Return arrays (points, trials)."""
+    batch, places = batch.distinct()
     rows = _Rows({"gains": gains}, batch.by_trial, ROWS)
-    return rows.apply(
+    results = rows.apply(
         lambda *arguments: _simulate(*batch.shared, *arguments, batch.names, batch.pointing, rows.devices)
     )
+    return jax.tree.map(lambda v: v[:, places], results)
 
 
 def simulate_trials(batch: Batch, gains: np.ndarray) -> Trials:
@@ -96,12 +111,16 @@ def simulate_with_derivatives(
     Returns:
         Metrics, statuses and derivatives.
     """
-    shifts = _no_shifts(batch, directions.shape[1]) if shifts is None else shifts
+    places = np.arange(len(batch.trials))
+    if shifts is None:
+        batch, places = batch.distinct()
+        shifts = _no_shifts(batch, directions.shape[1])
     by_point = {"gains": gains, "directions": directions}
     rows = _Rows(by_point, {**batch.by_trial, "shifts": dict(shifts)}, ROWS_WITH_DERIVATIVES)
     values, derivatives = rows.apply(
         lambda *arguments: _simulate_with_derivatives(*batch.shared, *arguments, batch.names, metrics, rows.devices)
     )
+    values, derivatives = values[:, places], derivatives[:, places]
     return Derivatives(values[..., :-1], values[..., -1].astype(int), derivatives[..., :-1])
 
 
