@@ -105,9 +105,9 @@ def sensitivities(
 ) -> dict[str, dict[str, float]]:
     """Return d ln(RMS of metric) / d ln(gain) over the averaged trials, in percent per percent.
 
-    The sensitivities are central finite differences inside the bounds. They use the program
-    without gradients: to compile one with the gradients of these metrics would take longer than these few runs. A metric
-    whose RMS is zero or has no value is omitted. A gain that is zero has no relative change and is omitted.
+    The sensitivities are central finite differences inside the bounds. They use the
+    program without gradients: the compilation of another one with gradients would take longer than these few runs. A
+    metric whose RMS is zero or has no value is omitted. A gain that is zero has no relative change and is omitted.
 
     Args:
         problem: the tuning problem.

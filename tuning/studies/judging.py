@@ -17,6 +17,7 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Limit, Scenario
 from ptsmc_jax.scenario.timing import Reach
 from ptsmc_jax.simulation import requirements
+from ptsmc_jax.simulation.catalogues import POINTING
 from ptsmc_jax.simulation.requirements import Verdict
 from tuning.search import confirm, gains, simulations, trust
 from tuning.search.objective import Problem, coordinates_of
@@ -53,7 +54,7 @@ def judge(scenario: Scenario, held_out_seed: int, problem: Problem | None = None
     """Simulate a scenario on its held-out trials, on the flight clock.
 
     The program of the search simulates the trials if it serves the scenario, too. The results then have only the
-    pointing metrics that the problem needs.
+    pointing metrics that the problem and the requirements need.
 
     Args:
         scenario: scenario with the gains.
@@ -70,6 +71,8 @@ def judge(scenario: Scenario, held_out_seed: int, problem: Problem | None = None
     if gains.gains_of(same) != gains.gains_of(simulated.parts):  # an axis differs from the mean of the axes
         return montecarlo.run(simulated.parts, simulated.dispersion, held_out_seed, trials)
     coordinates = coordinates_of(simulated.dispersion, held_out_seed, trials)
+    # a limit on a fraction of the time is a limit at all times in the search, but not in the verdict
+    judged = {*problem.batch.pointing, *(name for r in simulated.requirements for name in (r.metric, r.timed))}
     batch = Batch(
         simulated.parts,
         simulated.dispersion,
@@ -77,7 +80,7 @@ def judge(scenario: Scenario, held_out_seed: int, problem: Problem | None = None
         problem.names,
         trials.astype(np.uint32),
         coordinates,
-        problem.batch.pointing,
+        tuple(name for name in POINTING if name in judged),
     )
     return simulations.simulate_trials(batch, gain_values)
 
