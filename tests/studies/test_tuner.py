@@ -288,6 +288,14 @@ def test_held_out_trials_of_the_search_program_equal_those_of_a_campaign(gain):
         np.testing.assert_allclose(values, campaign.metrics[name], rtol=1e-9, atol=1e-15, err_msg=name)
 
 
+def test_published_gains_of_another_law_are_judged_without_the_search_program():
+    loaded = scenario.replace(scenario.from_tables(tomllib.loads(SHORT_CHAIN)), tune=None, controller={"kind": "pd"})
+    problem = posing.set_up_tuning(posing.with_tune(loaded), 0).problem
+    published = judging.reference_scenarios(loaded)[0]["published"]
+    judged, campaign = judging.judge(published, 5, problem), judging.judge(published, 5)
+    np.testing.assert_array_equal(judged.metrics.window_error, campaign.metrics.window_error)
+
+
 def test_judging_changes_only_the_clock():
     loaded = scenario.read(FIRST_FLIGHT)
     simulated = judging.on_flight_clock(loaded)

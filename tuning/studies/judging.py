@@ -18,6 +18,7 @@ from ptsmc_jax.scenario.tables import Limit, Scenario
 from ptsmc_jax.scenario.timing import Reach
 from ptsmc_jax.simulation import requirements
 from ptsmc_jax.simulation.catalogues import POINTING
+from ptsmc_jax.simulation.gains import paths_of
 from ptsmc_jax.simulation.requirements import Verdict
 from tuning.search import confirm, gains, simulations, trust
 from tuning.search.objective import Problem, coordinates_of
@@ -64,7 +65,8 @@ def judge(scenario: Scenario, held_out_seed: int, problem: Problem | None = None
     """
     simulated = _on_flight_clock(scenario, problem, reach)
     trials = np.arange(count_held_out_trials(simulated))
-    if problem is None or not scenario.sampled:
+    # published gains may belong to another law than the problem
+    if problem is None or not scenario.sampled or not set(problem.names) <= paths_of(simulated.parts).keys():
         return montecarlo.run(simulated.parts, simulated.dispersion, held_out_seed, trials)
     gain_values = np.asarray(gains.present_values(simulated.parts, problem.names))
     same = gains.with_gains(simulated.parts, dict(zip(problem.names, gain_values, strict=True)))
