@@ -463,4 +463,5 @@ def _check_torques_match_motion(
     if fits and ratio < 0.0:
         raise RefusedError(f"{message}; check the signs of these columns")
     if abs(np.log(abs(ratio))) > np.log(MAX_TORQUE_RATIO):
-        raise RefusedError(f"{message}; check telemetry.{key} and spacecraft.inertia")
+        rate_unit = ", telemetry.rate_unit" if rate_t is t else ""
+        raise RefusedError(f"{message}; check telemetry.{key}{rate_unit} and spacecraft.inertia")

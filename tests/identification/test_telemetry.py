@@ -199,7 +199,7 @@ def test_a_large_gyro_bias_is_no_error_of_the_unit():
     [
         ("sent", 1.0, None),
         ("sent", 1e3, 'columns sent1, sent2, sent3; set telemetry.torque_unit = "mN m"'),
-        ("sent", 1e-3, "check telemetry.torque_unit and spacecraft.inertia"),
+        ("sent", 1e-3, "check telemetry.torque_unit"),
         ("sent", -1.0, "check the signs"),
         ("speed", 1.0, None),
         ("speed", 30.0 / np.pi, 'columns speed1, speed2, speed3; set telemetry.speed_unit = "rpm"'),
@@ -216,6 +216,16 @@ def test_torques_and_wheel_speeds_in_another_unit_are_refused_with_that_unit(rea
     (rows,), _ = synthetic.logs(np.random.default_rng(0), np.diag([0.06, 0.08, 0.12]), wheels=True)
     rows = rows.select("t", *names, pl.col(f"^{reading}.$")).with_columns(pl.col(name) * factor for name in names)
     with refuses(RefusedError, words) if words else nullcontext():
+        telemetry.measurements(scenario.from_tables(tables), rows)
+
+
+def test_rates_without_attitudes_in_another_unit_are_refused_with_the_key_of_their_unit():
+    (rows,), _ = synthetic.logs(np.random.default_rng(0), np.diag([0.06, 0.08, 0.12]))
+    rows = rows.select("t", "^sent.$", pl.col("^measured_w.$") * 180.0 / np.pi)
+    tables = {
+        "spacecraft": {"inertia": [0.05, 0.09, 0.11]}, "loop": {"mode": "sampled"}, "disturbance": {"kind": "none"},
+    }  # fmt: skip
+    with refuses(RefusedError, "check telemetry.torque_unit, telemetry.rate_unit and spacecraft.inertia"):
         telemetry.measurements(scenario.from_tables(tables), rows)
 
 
