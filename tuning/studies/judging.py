@@ -118,7 +118,7 @@ def verdicts_of(
     selection = 0 if trials.status.size == 1 else slice(None)
 
     def values(name: str) -> np.ndarray:
-        return getattr(trials.metrics, name)[selection]
+        return trials.metrics[name][selection]  # KeyError instead of NaN if the trials lack a required metric
 
     simulated = requirements.verdicts(ready.requirements, values, trials.finished[selection])
     return [*simulated, *margin_verdicts.judge_trials(ready, held_out_seed)]
