@@ -91,13 +91,12 @@ def advice_on_margin(metric: str, limit: float, worst: float) -> Iterable[Any]:
     return advice(verdict), advice({**verdict, "trials": 1})
 
 
-def looks(count: int) -> Iterable[str]:
-    """Return the report of a search after this number of looks at held-out trials, each at 95 % confidence."""
+def verified(count: int) -> Any:
+    """Return the report of a search after this number of verifications, each at 95 % confidence."""
     asked = Requirement("peak_torque", 0.5, quantile=0.9, confidence=0.95)
     found = {"earlier": (count - 1) * [earlier("peak_torque")], "margins": {"peak_torque": 0.05}}
-    return tune_report.search_lines(
-        examples.tune(found, verdicts=[asked.verdict(np.zeros(1000), np.ones(1000, bool)).in_summary()])
-    )
+    verdict = asked.verdict(np.zeros(1000), np.ones(1000, bool)).in_summary()
+    return tune_report.build(examples.tune(found, verdicts=[verdict]))
 
 
 def conflict(**limits: float | None) -> Iterable[str]:
@@ -182,8 +181,8 @@ TUNINGS: dict[str, Callable[[], Any]] = {
             verdicts=[{**MARGIN, "worst": 4.8, "margin": 1.2}],
         )
     ),
-    "one look at held-out trials": lambda: looks(1),
-    "three looks at held-out trials": lambda: looks(3),  # 0.95^3 were reported as 95 %
+    "one verification on held-out trials": lambda: verified(1),
+    "three verifications on held-out trials": lambda: verified(3),  # 0.95^3 were reported as 95 %
     "one gain of the observer": lambda: gains_by_axis(observer_gain=50.0),
     "gains of the observer by axis": lambda: gains_by_axis(
         observer_gain=45.0, observer_gain_1=50.0, observer_gain_2=40.0

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
+from functools import partial
 
 from ptsmc_jax.simulation.catalogues import CATALOGUES, MARGINS, NO_SIGN, percent
 from ptsmc_jax.simulation.requirements import quantity
@@ -41,7 +42,9 @@ def build(summary: Tune) -> Report:
         *_shortest_time_lines(summary),
     ]
     sections = [
-        *report.requirement_sections(summary.verdicts),
+        *report.requirement_sections(
+            summary.verdicts, partial(_describe_verdict, verifications=1 + len(summary.search.earlier))
+        ),
         Section("Gains", [gain_table(summary)]),
         Section("Can the result be trusted?", [Text(trust_lines)]),
     ]
@@ -152,7 +155,6 @@ def search_lines(summary: Tune) -> Iterator[str]:
         yield f"best compromise: {text}"
     yield from _conflict_lines(summary)
     yield from _continuation_lines(record)
-    yield from _confidence_lines(summary)
     for count in record.confirmed:
         most = count["allowed"]
         needed = "which takes more trials" if most is None else f"thus at most {most} trials beyond the limit"
@@ -211,19 +213,16 @@ def _continuation_lines(record: Search) -> Iterator[str]:
             )
 
 
-def _confidence_lines(summary: Tune) -> Iterator[str]:
-    """Return the confidence of verdicts after several looks at held-out trials, each on other trials.
+def _describe_verdict(verdict: Entry, verifications: int) -> str:
+    """Return a verdict in words, with its joint confidence after several verifications, each on other trials.
 
-    Each look accepts gains that miss the requirement with a probability of at most 1 - c, so k looks do with at most
-    1 - c^k.
+    Each verification accepts gains that miss the requirement with a probability of at most 1 - c, so k verifications do
+    with at most 1 - c^k.
     """
-    looks = 1 + len(summary.search.earlier)
-    for verdict in summary.verdicts if looks > 1 else ():
-        if verdict.confidence is not None and verdict.met:
-            yield (
-                f"{verdict.metric}: the confidence is {percent(verdict.confidence**looks)} % instead of "
-                f"{percent(verdict.confidence)} %, because these are the gains of look {looks} at held-out trials"
-            )
+    if verifications == 1 or verdict.confidence is None or not verdict.met:
+        return str(verdict)
+    joint = percent(verdict.confidence**verifications)
+    return f"{verdict}, but with a joint confidence of {joint} % after {verifications} verifications on other trials"
 
 
 def _describe_worst_case(hardest: Row, *, tuned_for: bool) -> str:
