@@ -92,9 +92,9 @@ The name of any [metric](metrics.md), with the largest value that is allowed in 
 is `window_error = { limit = 1e-4, quantile = 0.9973, confidence = 0.9 }`. For a [pointing error](pointing.md), the
 table may be `ape_boresight = { limit = 1e-3, probability = 0.9973, confidence = 0.9, interpretation = "mixed" }`.
 
-The sampled loop may also have required margins, which are numbers. `gain_margin` [dB], `phase_margin` [deg] and
-`delay_margin` [s] are lower limits. `peak_sensitivity` [dB] is the largest allowed peak sensitivity M_s. A table has
-these keys:"""
+The sampled loop may also have required margins, as numbers or with a unit, such as `"6 dB"`. `gain_margin` [dB],
+`phase_margin` [deg] and `delay_margin` [s] are lower limits. `peak_sensitivity` [dB] is the largest allowed peak
+sensitivity M_s. A table has these keys:"""
 
 SUITE = sensor_tables.SUITE_MEANING.replace("Kalman filter", "[Kalman filter](theory/sensor_suites.md)")
 
