@@ -113,9 +113,12 @@ def test_single_nominal_trial_is_judged_without_the_quantile():
     del tables["tune"], tables["dispersion"], tables["hardware"]
     trials: Any = SimpleNamespace(status=np.zeros(1), finished=np.ones(1, bool), ok=np.ones(1, bool))
     for torque, met in ((2.9, True), (3.1, False)):
-        trials.metrics = SimpleNamespace(peak_torque=np.array([torque]))
+        trials.metrics = {"peak_torque": np.array([torque])}
         (verdict,) = judging.verdicts_of(scenario.from_tables(tables), trials, 1)
         assert (verdict.met, verdict.quantile, verdict.worst) == (met, None, torque)
+    trials.metrics = {}  # a verdict on a metric that the trials lack would always be "not met"
+    with pytest.raises(KeyError, match="peak_torque"):
+        judging.verdicts_of(scenario.from_tables(tables), trials, 1)
 
 
 def test_accuracy_gain_uses_trials_that_both_sets_of_gains_finish():
