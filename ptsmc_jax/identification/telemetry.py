@@ -398,6 +398,22 @@ def _integrate(t: Values, values: Values) -> Values:
     return np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(increments, axis=0)])
 
 
+def _measured_rates(log: Measurements) -> tuple[Values, Values]:
+    """Return times (rows,) [s] and body rates (rows, 3) [rad/s], from the attitudes if the log has no rates.
+
+    There are no rows if the log has fewer than `MIN_ROWS` attitudes.
+    """
+    rate = log.readings.get("rate", np.full((1, 3), np.nan))
+    if np.isfinite(rate).any():
+        return log.t, rate
+    has_attitude = ~np.isnan(log.readings["attitude"][:, 0])
+    if has_attitude.sum() < MIN_ROWS:
+        return np.zeros(0), np.zeros((0, 3))
+    attitudes, times = Rotation.from_quat(log.readings["attitude"][has_attitude]), log.t[has_attitude]
+    rotations = (attitudes[:-1].inv() * attitudes[1:]).as_rotvec()
+    return 0.5 * (times[1:] + times[:-1]), rotations / np.diff(times)[:, None]
+
+
 def _check_torques_match_motion(
     scenario: SpacecraftScenario, config: Telemetry, columns: Sequence[str], log: Measurements
 ) -> None:
@@ -419,21 +435,15 @@ def _check_torques_match_motion(
     if walk or disturbance is None:
         return
     t, interval = log.t, np.append(np.diff(log.t), 0.0)[:, None]
-    if log.wheel_inertia is not None:
-        impulse = -log.wheel_inertia * (log.command - log.command[0]) @ axes
+    wheel_inertia = log.wheel_inertia
+    if wheel_inertia is not None:
+        impulse = -wheel_inertia * (log.command - log.command[0]) @ axes
     else:
         impulse = np.cumsum(log.command * interval, axis=0) @ axes
         impulse = np.concatenate([np.zeros((1, 3)), impulse[:-1]])
-    rate = log.readings.get("rate", np.full((1, 3), np.nan))
-    if np.isfinite(rate).any():
-        rate_t = t
-    else:
-        has_attitude = ~np.isnan(log.readings["attitude"][:, 0])
-        if has_attitude.sum() < MIN_ROWS:
-            return
-        attitudes, times = Rotation.from_quat(log.readings["attitude"][has_attitude]), t[has_attitude]
-        rate_t = 0.5 * (times[1:] + times[:-1])
-        rate = (attitudes[:-1].inv() * attitudes[1:]).as_rotvec() / np.diff(times)[:, None]
+    rate_t, rate = _measured_rates(log)
+    if not rate_t.size:
+        return
     momentum = _smooth_rates(rate_t, rate) @ formulas.check_inertia(scenario.true_inertia)
     impulse = np.stack([np.interp(rate_t, t, column) for column in impulse.T], axis=1)
     for count in COMPARED_PARTS:
@@ -449,13 +459,13 @@ def _check_torques_match_motion(
     torque = np.sqrt(np.mean(np.square(np.diff(impulse, axis=0) / np.diff(rate_t)[:, None])))
     if max(1.0, abs(ratio)) * torque < MIN_TORQUE_TO_DISTURBANCE * disturbance[0]:
         return
-    key, kinds = ("speed_unit", SpeedUnit) if log.wheel_inertia is not None else ("torque_unit", TorqueUnit)
-    units, unit = UNITS["rad/s" if log.wheel_inertia is not None else "N m"], getattr(config, key)
+    key, kinds = ("speed_unit", SpeedUnit) if wheel_inertia is not None else ("torque_unit", TorqueUnit)
+    units, unit = UNITS["rad/s" if wheel_inertia is not None else "N m"], getattr(config, key)
     errors = {other: abs(np.log(abs(ratio) * units[unit] / units[other])) for other in get_args(kinds)}
     likely_unit = min(errors, key=lambda other: errors[other])
     fits = errors[likely_unit] < np.log(UNIT_RATIO_ERROR)
     message = (
-        f"{log.name} has {'wheel speeds' if log.wheel_inertia is not None else 'torques'} that do not fit its motion: "
+        f"{log.name} has {'wheel speeds' if wheel_inertia is not None else 'torques'} that do not fit its motion: "
         f"the momentum changes by {ratio:.3g} times the impulse of the columns {', '.join(columns)}"
     )
     if fits and likely_unit != unit:
@@ -463,5 +473,5 @@ def _check_torques_match_motion(
     if fits and ratio < 0.0:
         raise RefusedError(f"{message}; check the signs of these columns")
     if abs(np.log(abs(ratio))) > np.log(MAX_TORQUE_RATIO):
-        rate_unit = ", telemetry.rate_unit" if rate_t is t else ""
+        rate_unit = ", telemetry.rate_unit" if rate_t is log.t else ""
         raise RefusedError(f"{message}; check telemetry.{key}{rate_unit} and spacecraft.inertia")

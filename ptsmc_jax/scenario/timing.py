@@ -117,9 +117,7 @@ def choose_timing(
     loop, visited = scenario.loop, None
     disturbed = {"disturbance.frequency": max(term.largest_frequency() for term in scenario.terms)}
     with np.errstate(over="ignore"):  # `_check_steps` refuses huge frequencies
-        frequencies = disturbed | scenario.frequencies(
-            setup, reach.smallest_t_f
-        )  # [rad/s], by the key that causes them
+        frequencies = disturbed | scenario.frequencies(setup, reach.smallest_t_f)  # [rad/s], by key that causes them
     if reach.t_f > scenario.controller.t_f:
         scenario.check_reference_until(scenario.end + reach.t_f - scenario.controller.t_f)
     if setup.plant.custom_functions:

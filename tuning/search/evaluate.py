@@ -76,7 +76,7 @@ class Evaluator:
 
     def measure(self, problem: Problem, normalised: np.ndarray) -> Measurement:
         """Return F, constraints and objective at points, (points, gains) normalised gains."""
-        self.rollouts += len(normalised) * len(problem.batch.distinct()[0].trials)
+        self.rollouts += len(normalised) * _count_trials(problem)
         return Measurement(**self._answer(problem, normalised, with_gradients=False))
 
     def measure_with_gradients(self, problem: Problem, normalised: np.ndarray) -> MeasurementWithGradients:
@@ -89,7 +89,7 @@ class Evaluator:
             self._known_problem, self._known = encoded, {}
         new = [k for k, key in enumerate(keys) if key not in self._known]
         if new:
-            self.gradients += len(new) * len(problem.batch.distinct()[0].trials)
+            self.gradients += len(new) * _count_trials(problem)
             measured = MeasurementWithGradients(**self._answer(problem, normalised[new], with_gradients=True))
             self._known |= {keys[k]: measured.at(place) for place, k in enumerate(new)}
         known = [vars(self._known[key]) for key in keys]
@@ -156,6 +156,11 @@ def _apply_in_calls(program: Callable[..., dict[str, jax.Array]], *arrays: np.nd
         for k in range(0, len(padded[0]), POINTS_PER_CALL)
     ]
     return {name: np.concatenate([call[name] for call in calls])[:count] for name in calls[0]}
+
+
+def _count_trials(problem: Problem) -> int:
+    """Return the number of trials that are simulated at a point: repeated trials count once."""
+    return len(problem.batch.distinct()[0].trials)
 
 
 _ADDRESS = re.compile("0x[0-9a-f]+")  # address of a custom function, different in each process

@@ -17,12 +17,12 @@ from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Limit, Scenario
 from ptsmc_jax.scenario.timing import Reach
 from ptsmc_jax.simulation import requirements
+from ptsmc_jax.simulation.assembly import Parts
 from ptsmc_jax.simulation.catalogues import POINTING
 from ptsmc_jax.simulation.gains import paths_of
 from ptsmc_jax.simulation.requirements import Verdict
 from tuning.search import confirm, gains, simulations, trust
 from tuning.search.objective import Problem, coordinates_of
-from tuning.search.simulations import Batch
 
 
 def derive_held_out_seed(seed: int, turn: int = 0) -> int:
@@ -65,26 +65,31 @@ def judge(scenario: Scenario, held_out_seed: int, problem: Problem | None = None
     """
     simulated = _on_flight_clock(scenario, problem, reach)
     trials = np.arange(count_held_out_trials(simulated))
-    # published gains may belong to another law than the problem
-    if problem is None or not scenario.sampled or not set(problem.names) <= paths_of(simulated.parts).keys():
+    if problem is None or not _is_served(simulated.parts, problem):
         return montecarlo.run(simulated.parts, simulated.dispersion, held_out_seed, trials)
-    gain_values = np.asarray(gains.present_values(simulated.parts, problem.names))
-    same = gains.with_gains(simulated.parts, dict(zip(problem.names, gain_values, strict=True)))
-    if gains.gains_of(same) != gains.gains_of(simulated.parts):  # an axis differs from the mean of the axes
-        return montecarlo.run(simulated.parts, simulated.dispersion, held_out_seed, trials)
-    coordinates = coordinates_of(simulated.dispersion, held_out_seed, trials)
+    batch = problem.batch
     # a limit on a fraction of the time is a limit at all times in the search, but not in the verdict
-    judged = {*problem.batch.pointing, *(name for r in simulated.requirements for name in (r.metric, r.timed))}
-    batch = Batch(
-        simulated.parts,
-        simulated.dispersion,
-        held_out_seed,
-        problem.names,
-        trials.astype(np.uint32),
-        coordinates,
-        tuple(name for name in POINTING if name in judged),
+    judged = {*batch.pointing, *(name for r in simulated.requirements for name in (r.metric, r.timed))}
+    batch = batch._replace(
+        parts=simulated.parts,
+        dispersion=simulated.dispersion,
+        seed=held_out_seed,
+        trials=trials.astype(np.uint32),
+        coordinates=coordinates_of(simulated.dispersion, held_out_seed, trials),
+        pointing=tuple(name for name in POINTING if name in judged),
     )
-    return simulations.simulate_trials(batch, gain_values)
+    return simulations.simulate_trials(batch, np.asarray(gains.present_values(simulated.parts, problem.names)))
+
+
+def _is_served(parts: Parts, problem: Problem) -> bool:
+    """Return whether the program of the search simulates these parts with their gains.
+
+    Published gains may belong to another law, or differ by axis where the search tunes one gain for all axes.
+    """
+    if not parts.clock.sampled or not set(problem.names) <= paths_of(parts).keys():
+        return False
+    values = dict(zip(problem.names, gains.present_values(parts, problem.names), strict=True))
+    return gains.gains_of(gains.with_gains(parts, values)) == gains.gains_of(parts)
 
 
 def _on_flight_clock(scenario: Scenario, problem: Problem | None, reach: Reach | None = None) -> Study:

@@ -15,9 +15,8 @@ from contourpy import contour_generator
 
 from ptsmc_jax.campaigns import margin_verdicts, montecarlo, store
 from ptsmc_jax.figures import study_plots, style
-from ptsmc_jax.scenario import Study, custom, errors, keys, parsing, study
+from ptsmc_jax.scenario import Study, custom, errors, keys, parsing, study, tables
 from ptsmc_jax.scenario import replace as replace_keys
-from ptsmc_jax.scenario import requirements as required_by
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import requirements
@@ -372,7 +371,7 @@ def write(folder: Path, simulated: Map, seed: int, figures: bool) -> None:
             study_plots.MapAxis(label, axis.values, axis.logarithmic)
             for label, axis in zip(keys_with_units, (x, y), strict=True)
         )
-        limit = next((r.limit for r in required_by(scenario) if r.metric == "peak_torque"), None)
+        limit = tables.limit_of(scenario, "peak_torque")
         figure = study_plots.accuracy_map(
             x_axis,
             y_axis,
