@@ -151,8 +151,8 @@ def autocorrelation(names: list[str], values: np.ndarray, limits: np.ndarray) ->
 def estimates(table: "DataFrame") -> Figure:
     """Draw the change of each number, relative to the largest number of its parameter, with its 95 % interval.
 
-    The prior interval is drawn beside it in grey. The prior knowledge of a phase is that it is uniform over the circle.
-    `table` is that of `Identification.table`.
+    The prior interval is drawn beside it in grey. A phase is uniform over the circle in the prior knowledge. `table` is
+    the result of `Identification.table`.
     """
     rows = list(table.iter_rows(named=True))
     figure = Figure(figsize=(8.0, 1.2 + 0.4 * len(rows)), layout="constrained")

@@ -491,8 +491,8 @@ def _coupling_parameter(model: Model, sigmas: np.ndarray, has_prior: bool) -> Pa
 def _inertia_parameter(start: np.ndarray, prior: object) -> Parameter:
     """Return the inertia parameter, in log-Cholesky coordinates of the pseudo-inertia. Every value is physical.
 
-    The prior covariance is that of the dispersion, to first order in the rotation of the principal axes. The axes are
-    known if the dispersion does not rotate them. The estimate then has the principal axes of the scenario.
+    The prior covariance equals the covariance of the dispersion, to first order in the rotation of the principal axes.
+    If the dispersion does not rotate the axes, they are known, and the estimate has the axes of the scenario.
     """
     table = getattr(prior, "inertia", None)
     if table is not None and hasattr(table, "factor"):

@@ -247,9 +247,9 @@ def verdict(identification: Identification) -> list[str]:
 
 
 def _noise_ratios(identification: Identification) -> list[str]:
-    """Return a sentence with the ratio of each estimated noise to that of the scenario.
+    """Return a sentence with the ratio of each estimated noise to its value in the scenario.
 
-    Innovations always fit an estimated noise, and the verdict does not detect an error of the scenario's value.
+    Innovations always fit an estimated noise. The verdict therefore does not detect a wrong value in the scenario.
     """
     problem = identification.problem
     names = [one.name for one in problem.parameters for _ in one.labels]
@@ -260,7 +260,7 @@ def _noise_ratios(identification: Identification) -> list[str]:
         )
         if name.endswith("_noise") and name not in problem.unknown_noises
     ]
-    return [f"estimated noise over that of the scenario: {', '.join(ratios)}"] if ratios else []
+    return [f"ratio of the estimated noise to its value in the scenario: {', '.join(ratios)}"] if ratios else []
 
 
 def _far_estimates(identification: Identification) -> list[str]:

@@ -117,7 +117,7 @@ def test_the_verdict_states_the_ratio_of_an_estimated_noise_to_that_of_the_scena
     """The innovations fit an estimated noise. Without a noise in the scenario, there is nothing to compare."""
     loaded = scenario.replace(chain(["disturbance_bias", "state_noise"]), hardware=hardware)
     found = explore.identify(loaded, chain_log()[0])
-    lines = [line for line in found.verdict if "estimated noise over that of the scenario" in line]
+    lines = [line for line in found.verdict if "ratio of the estimated noise to its value in the scenario" in line]
     assert len(lines) == sentences
     ratio = found.estimate[found.problem.labels.index("state_noise_1")] / 4e-3
     assert all(f"state_noise_1 {ratio:.3g}, state_noise_2 " in line for line in lines)

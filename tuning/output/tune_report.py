@@ -157,7 +157,7 @@ def search_lines(summary: Tune) -> Iterator[str]:
     yield from _continuation_lines(record)
     for count in record.confirmed:
         most = count["allowed"]
-        needed = "which takes more trials" if most is None else f"thus at most {most} trials beyond the limit"
+        needed = "which takes more trials" if most is None else f"so at most {most} trials beyond the limit"
         yield (
             f"{count['metric']} {'confirmed' if count['confirmed'] else 'NOT confirmed'} on {count['trials']} other "
             f"trials, {count['violations']} of them beyond the limit: the held-out trials will meet it with a "
