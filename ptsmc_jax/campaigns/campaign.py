@@ -259,7 +259,13 @@ def make_parts(
 
 
 def report_progress(parts: Iterable[tuple[Part, int]], tally: Tally, report: Callable[[Tally], None]) -> None:
-    """Report the progress after each part."""
+    """Add each written part to the progress, and report the progress.
+
+    Args:
+        parts: the parts, yielded when they are written, each with its number of failed trials.
+        tally: progress before the first of these parts; its counts are increased in place.
+        report: function that shows the progress, called once before the first part and once after each part.
+    """
     report(tally)
     for part, failed in parts:
         tally.done += part.count

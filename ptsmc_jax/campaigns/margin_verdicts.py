@@ -107,7 +107,17 @@ def has_different_loops(dispersion: Dispersion) -> bool:
 
 
 def signed_violation_ratio(value: Any, limit: Any, name: str) -> Any:
-    """Return 1 for a margin at its limit, more for a violated limit, and less or a negative number on the safe side."""
+    """Return 1 for a margin at its limit, more for a violated limit, and less or a negative number on the safe side.
+
+    Args:
+        value: value of the margin, in the unit of `catalogues.MARGINS`, a number or an array of any shape.
+        limit: required limit in the same unit, not 0.
+        name: name of the margin in `MARGINS`, which decides whether the limit is the smallest or the largest allowed
+            value.
+
+    Returns:
+        The ratio [-], in the shape of `value`.
+    """
     return 2.0 - value / limit if MARGINS[name].at_least else value / limit
 
 

@@ -126,12 +126,31 @@ def one(
 
 @programs.jit
 def coordinates(dispersion: Dispersion, seed: jax.Array, trials: jax.Array) -> Coordinates:
-    """Return the random numbers of the dispersions [-] for these trials (trials,), with a leading axis over trials."""
+    """Return the random numbers of the dispersions for many trials.
+
+    Args:
+        dispersion: the dispersions.
+        seed: seed of the dispersions, a whole number.
+        trials: numbers of the trials, (trials,).
+
+    Returns:
+        The numbers of each dispersion by name, (trials, count) [-].
+    """
     return jax.vmap(lambda trial: dispersion.coordinates(seed, trial))(trials)
 
 
 def values(parts: Parts, dispersion: Dispersion, seed: WholeNumber, trial: WholeNumber | Row) -> dict[str, jax.Array]:
-    """Return the dispersed quantities of a trial by name, without simulating it; arguments as for `one`."""
+    """Return the dispersed quantities of a trial by name, without simulating it.
+
+    Args:
+        parts: the nominal parts.
+        dispersion: the dispersions.
+        seed: seed of the dispersions, a whole number.
+        trial: number of the trial, or a `Row` of a run table, which states its seed.
+
+    Returns:
+        A scalar for each component, by the name of its column in the rows, in SI units.
+    """
     trial_parts = trial_setup(parts, dispersion, seed, trial)
     coordinates = trial_parts.dispersion.coordinates(trial_parts.seed, trial_parts.trial)
     return _read_dispersed_values(
@@ -259,7 +278,13 @@ def _program_shape(count: int, block: int | None = None) -> tuple[int, int, int]
 
 
 def prepare(parts: Parts, dispersion: Dispersion, count: int) -> None:
-    """Start to compile the program for `count` trials of these parts in the background."""
+    """Start to compile the program of `run` in the background.
+
+    Args:
+        parts: the nominal parts; only the shapes of their arrays matter.
+        dispersion: the dispersions.
+        count: number of trials of the later call of `run`.
+    """
     shape = _program_shape(count)
     numbers = np.zeros(shape, dtype=np.uint32)
     _simulate_rows.prepare(
@@ -353,7 +378,16 @@ def map_in_blocks(function: Callable, trials: PyTree) -> PyTree:
 
 
 def map_over_devices(function: Callable, shared: PyTree, devices: int) -> PyTree:
-    """Return function(shared), with the first axes of argument and results distributed over the devices."""
+    """Return function(shared), with the first axes of argument and result distributed over the devices.
+
+    Args:
+        function: function of a pytree of arrays, which runs once on each device with its entries of the first axes.
+        shared: argument of the function, arrays (devices, ..).
+        devices: number of devices.
+
+    Returns:
+        The results of all devices, arrays (devices, ..).
+    """
     if devices == 1:
         return function(shared)
     mesh = Mesh(np.asarray(configure.devices()[:devices]), ("device",))

@@ -92,7 +92,16 @@ class Rows:
                 path.unlink(missing_ok=True)
 
     def checksum(self, first: int, count: int, content: bytes) -> str:
-        """Return the checksum of a part with this content."""
+        """Return the checksum of a part, which depends on the campaign, the numbers of the trials and the rows.
+
+        Args:
+            first: number of the first trial of the part.
+            count: number of trials of the part.
+            content: content of the Parquet file.
+
+        Returns:
+            32 hexadecimal digits.
+        """
         checksum = hashlib.blake2b(content, digest_size=16, key=self.key)
         checksum.update(f"{first}+{count}".encode())
         return checksum.hexdigest()

@@ -82,13 +82,27 @@ def _read_json(path: Path) -> dict[str, Any]:
 
 
 def read_previous_summary(folder: Path, scenario: Tables, made_by: Tables) -> dict[str, Any] | None:
-    """Return the summary of the same scenario, command, seed and other inputs (`versions`); None if there is none."""
+    """Return the summary of an earlier run of the same scenario, command, seed and other inputs.
+
+    Args:
+        folder: the result folder.
+        scenario: tables of the scenario of this run, with all defaults.
+        made_by: command, seed and other inputs of this run, see `versions`.
+
+    Returns:
+        The content of `summary.json`, or None if the folder has no summary of this run.
+    """
     summary = {} if describe_difference(folder, scenario, made_by) else _read_json(folder / SUMMARY)
     return summary if "status" in summary else None
 
 
 def has_unfinished_run(folder: Path, scenario: Tables, made_by: Tables) -> bool:
     """Return whether the folder contains this run and it is incomplete, see `begin_run`.
+
+    Args:
+        folder: the result folder.
+        scenario: tables of the scenario of this run, with all defaults.
+        made_by: command, seed and other inputs of this run, see `versions`.
 
     Raises:
         RefusedError: it contains another unfinished run, or one of other versions.
@@ -100,7 +114,16 @@ def has_unfinished_run(folder: Path, scenario: Tables, made_by: Tables) -> bool:
 
 
 def refuse_other_run(folder: Path, scenario: Tables, made_by: Tables) -> None:
-    """Raise RefusedError if the folder holds another run than this: see `describe_difference`."""
+    """Raise an error if the folder contains another run than this one, see `describe_difference`.
+
+    Args:
+        folder: the result folder.
+        scenario: tables of the scenario of this run, with all defaults.
+        made_by: command, seed and other inputs of this run, see `versions`.
+
+    Raises:
+        RefusedError: the folder contains a run of another scenario, command, seed or version.
+    """
     other = describe_difference(folder, scenario, made_by)
     if other is not None:
         raise RefusedError(
@@ -154,7 +177,17 @@ def end_run(folder: Path) -> None:
 
 
 def describe_difference(folder: Path, scenario: Tables, made_by: Tables) -> str | None:
-    """Return in words how the run in the folder differs from this run; None if it does not."""
+    """Describe the first difference between the run in a folder and this run.
+
+    Args:
+        folder: the result folder.
+        scenario: tables of the scenario of this run, with all defaults.
+        made_by: entries of versions.json that must be equal, such as command and seed.
+
+    Returns:
+        The content of the folder, such as "a run with seed 1, not 2", as the object of "the folder holds". None if the
+        runs are equal.
+    """
     versions = read_versions(folder)
     try:
         old_tables = parsing.read_toml(folder / "scenario.toml")
@@ -287,7 +320,16 @@ def _lock(file: IO[str], *, shared: bool) -> None:
 
 
 def check_file(file: Path, force: bool, option: str = "--force") -> None:
-    """Raise RefusedError if this file must not be written; option: name of the option that sets `force`."""
+    """Raise an error if a file must not be written.
+
+    Args:
+        file: the file to write.
+        force: whether an existing file may be replaced.
+        option: name of the option that sets `force`, for the error.
+
+    Raises:
+        RefusedError: the file exists already, it is a folder, or its folder does not exist.
+    """
     if not file.parent.is_dir():
         raise RefusedError(
             f"the file is {file}, but {file.parent} is no folder; allowed is a file in an existing folder"
@@ -335,7 +377,14 @@ def _temporary_place(folder: Path) -> Path:
 
 
 def write_run_files(folder: Path, scenario: Tables, made_by: Tables, summary: Tables | None = None) -> None:
-    """Write the files of every result folder: scenario.toml, versions.json, and the summary if there is one."""
+    """Write scenario.toml and versions.json of a run, and summary.json if there is a summary.
+
+    Args:
+        folder: the result folder.
+        scenario: tables of the scenario.
+        made_by: command, seed and other inputs of the run, see `versions`.
+        summary: content of `summary.json`; None if there is no summary yet.
+    """
     write_toml(folder / "scenario.toml", scenario)
     write_json(folder / "versions.json", versions(**made_by))
     if summary is not None:
@@ -362,7 +411,13 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Write a CSV file as a whole; numbers have enough digits to be read back exactly."""
+    """Write a CSV file. Its numbers have enough digits to be read back exactly.
+
+    Args:
+        path: the file; it replaces an existing one when all rows are written.
+        header: names of the columns.
+        rows: the cells of each row, in the order of the columns.
+    """
     with replace_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(header)
