@@ -293,6 +293,9 @@ def reduce_entries(eqn: Any, array: np.ndarray, fold: Callable[[np.ndarray], Any
         eqn: the equation.
         array: its operand.
         fold: function from entries (n,) to their sum, product or extreme.
+
+    Returns:
+        An object array in the shape of `array` without the reduced axes.
     """
     axes = eqn.params["axes"]
     kept = [a for a in range(array.ndim) if a not in axes]
@@ -320,6 +323,9 @@ def contract_entries(eqn: Any, left: np.ndarray, right: np.ndarray, inner: Calla
         left: its first operand.
         right: its second operand.
         inner: function from a row (n,) and a column (n,) to their scalar product.
+
+    Returns:
+        An object array in the shape of the equation's output.
     """
     a, b = _grouped_operands(eqn, (left, right))
     indices = itertools.product(range(len(a)), range(a.shape[1]), range(b.shape[1]))
@@ -333,6 +339,9 @@ def accumulate_entries(eqn: Any, array: np.ndarray, operation: Callable[[Any, An
         eqn: the equation.
         array: its operand.
         operation: (previous result, entry) -> result.
+
+    Returns:
+        An object array in the shape of `array`.
     """
     results = np.moveaxis(array.copy(), eqn.params["axis"], 0)
     for previous, k in itertools.pairwise(range(len(results))[:: -1 if eqn.params["reverse"] else 1]):
