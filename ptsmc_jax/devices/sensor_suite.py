@@ -92,10 +92,19 @@ class SensorSuite(SpacecraftSensors):
     def readings(
         self, memory: SuiteMemory, x: AttitudeState, now: Ticks, dt: Scalar, star_x: PyTree = None
     ) -> tuple[list[tuple[Array, Scalar, Array]], Array, SuiteMemory]:
-        """Return the readings at a sample, and the memory; see `Sensor.measure` for the arguments.
+        """Return the readings at a sample, and the memory.
+
+        Args:
+            memory: from `begin`, or from the last sample.
+            x: true attitude and rate.
+            now: the control period that the sample begins.
+            dt: length of the period that ends at the sample [s].
+            star_x: true states at the times of `newest_reading_age`, one for each attitude sensor, None for sensors
+                without their own clock; None if no sensor has one.
 
         Returns:
-            Reading, weight and age [s] of the delivery of each attitude sensor, the gyro sample (3,) [rad/s], memory.
+            For each attitude sensor the delivered reading (size,), its weight and its age [s]. Then the gyro sample
+            (3,) [rad/s], and the memory for the next sample.
         """
         noise_next = self.noise(memory.keys, now.sample + 1)
         *noises, shift = guards.lerp(now.noise_weight, memory.noise, noise_next)

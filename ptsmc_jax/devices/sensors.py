@@ -48,6 +48,9 @@ class Sensor(ABC):
             trial: number of the trial.
             x0: true state.
             now: the control period that this sample begins.
+
+        Returns:
+            The memory, a pytree of arrays, or None for sensors without it.
         """
 
     @abstractmethod
@@ -62,10 +65,24 @@ class Sensor(ABC):
             now: the control period that the sample begins.
             dt: length of the period that ends at the sample [s].
             star_x: true state at the time of `newest_reading_age`, for sensors with their own clock; None without them.
+
+        Returns:
+            The measured state, a pytree like `x`, and the memory for the next sample.
         """
 
     def sample(self, memory: PyTree, x: PyTree, now: Ticks, dt: Scalar, star_x: PyTree = None) -> tuple[PyTree, PyTree]:
-        """Return the readings before any filter, and the memory; see `measure` for the arguments, dt in [s]."""
+        """Return the readings before any filter, and the memory.
+
+        Args:
+            memory: from `begin`, or from the last sample.
+            x: true state.
+            now: the control period that the sample begins.
+            dt: length of the period that ends at the sample [s].
+            star_x: true state at the time of `newest_reading_age`, for sensors with their own clock; None without them.
+
+        Returns:
+            The readings, a pytree like `x`, and the memory for the next sample.
+        """
         return self.measure(memory, x, now, dt)
 
     def inputs(
@@ -73,7 +90,16 @@ class Sensor(ABC):
     ) -> tuple[dict[str, Array], PyTree]:
         """Return the sensor inputs of exported C at a sample, by name, and the memory.
 
-        See `measure` for the arguments.
+        Args:
+            memory: from `begin`, or from the last sample.
+            x: true state.
+            now: the control period that the sample begins.
+            dt: length of the period that ends at the sample [s].
+            star_x: true state at the time of `newest_reading_age`, for sensors with their own clock; None without them.
+
+        Returns:
+            For a spacecraft "attitude" (4,) [-] and "rate" (3,) [rad/s], otherwise "x", the measured state. Then the
+            memory for the next sample.
         """
         read, memory = self.sample(memory, x, now, dt, star_x)
         named = {"attitude": read.q, "rate": read.w} if isinstance(read, AttitudeState) else {"x": read}
