@@ -101,31 +101,60 @@ Combine = Callable[[Random, Numbers, Any], Numbers]
 
 
 def replace_nominal(random: Random, nominal: Numbers, parts: object) -> Random:
-    """Return the random numbers (n,) [SI units], without the nominal ones."""
+    """Return the random numbers without the nominal numbers.
+
+    Args:
+        random: random numbers (n,), in the unit of the quantity.
+        nominal: nominal numbers (n,), which are not used.
+        parts: the nominal parts, which are not used.
+    """
     return random
 
 
 def add_to_nominal(random: Random, nominal: Numbers, parts: object) -> Numbers:
-    """Return nominal numbers plus random numbers (n,) [SI units]."""
+    """Return the sum of nominal numbers and random numbers, (n,).
+
+    Args:
+        random: random numbers (n,), in the unit of the quantity.
+        nominal: nominal numbers (n,), in the same unit.
+        parts: the nominal parts, which are not used.
+    """
     return nominal + random
 
 
 def scale_nominal(random: Random, nominal: Numbers, parts: object) -> Numbers:
-    """Return nominal numbers (n,) [SI units] times 1 + random number [-].
+    """Return the nominal numbers, (n,), each multiplied by 1 + a random number.
 
     Each random number scales a group of n / count successive numbers.
+
+    Args:
+        random: relative changes (count,) [-], where n is a multiple of count.
+        nominal: nominal numbers (n,), in the unit of the quantity.
+        parts: the nominal parts, which are not used.
     """
     groups = nominal.reshape(random.size, nominal.size // max(random.size, 1))
     return jnp.ravel(groups * (1.0 + random)[:, None])
 
 
 def rotate_nominal(random: Random, nominal: Numbers, parts: object) -> Numbers:
-    """Return the nominal attitude (4,) rotated by a random rotation vector (3,) [rad]."""
+    """Return the nominal attitude rotated by a random rotation, a unit quaternion (4,).
+
+    Args:
+        random: rotation vector in body axes (3,) [rad].
+        nominal: nominal attitude, a unit quaternion (4,).
+        parts: the nominal parts, which are not used.
+    """
     return attitude.multiply(nominal, attitude.from_rotation_vector(random))
 
 
 def rotate_about_axis(random: Random, nominal: Numbers, parts: object) -> Numbers:
-    """Return the nominal attitude (4,) rotated about a random axis; see `axis_angle` for the numbers [-, rad, rad]."""
+    """Return the nominal attitude rotated about a random axis, a unit quaternion (4,).
+
+    Args:
+        random: z component [-] and azimuth [rad] of the axis, and the angle [rad], (3,), see `axis_angle`.
+        nominal: nominal attitude, a unit quaternion (4,).
+        parts: the nominal parts, which are not used.
+    """
     z, azimuth, angle = random[0], random[1], random[2]
     radius = jnp.sqrt(1.0 - z * z)
     axis = jnp.stack([radius * jnp.cos(azimuth), radius * jnp.sin(azimuth), z])
@@ -133,9 +162,12 @@ def rotate_about_axis(random: Random, nominal: Numbers, parts: object) -> Number
 
 
 def rotate_from_reference(random: Random, nominal: Numbers, parts: Any) -> Numbers:
-    """Return the reference attitude (4,) [-] at t = 0 rotated about a random axis; `nominal` is not used.
+    """Return the reference attitude at t = 0 rotated about a random axis, a unit quaternion (4,).
 
-    random: see `axis_angle` [-, rad, rad].
+    Args:
+        random: z component [-] and azimuth [rad] of the axis, and the angle [rad], (3,), see `axis_angle`.
+        nominal: nominal attitude (4,), which is not used.
+        parts: the nominal parts, whose reference is used.
     """
     return rotate_about_axis(random, parts.reference(jnp.zeros_like(parts.t_end)).q, parts)
 
