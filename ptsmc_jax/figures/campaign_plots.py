@@ -188,9 +188,14 @@ def inputs(
     outcome: np.ndarray,
     totals: Mapping[str, int],
 ) -> Figure:
-    """Plot metrics (rows) against dispersed quantities (columns), a point a trial, see `torque_by_angle`.
+    """Plot metrics against dispersed quantities, with a point for each trial.
 
-    The first quantity explains a metric best.
+    Args:
+        drawn: dispersed quantities by name, a column of the figure each, the quantity that explains a metric best
+            first.
+        metrics: metrics by name, a row of the figure each.
+        outcome: one of `MARKS` for each trial, (trials,).
+        totals: number of trials of the whole campaign with each outcome.
     """
     drawn, metrics = in_readable_units(drawn), in_readable_units(metrics)
     rows, columns = len(metrics), len(drawn)

@@ -30,9 +30,13 @@ def _decibels(values: np.ndarray) -> np.ndarray:
 
 @styled
 def nichols(L: np.ndarray, names: Sequence[str], limits: Mapping[str, float] = NO_LIMITS) -> Figure:
-    """Plot |L| over its phase (points, axes), with the point -1 and a contour of the sensitivity.
+    """Plot |L| over its phase, with the point -1 and a contour of the sensitivity.
 
-    `limits` are the required margins by name. The curves must not cross the lines of the gain and phase margins.
+    Args:
+        L: open-loop transfer function of each axis, complex (frequencies, axes) [-].
+        names: names of the axes.
+        limits: required margins by name, in dB and deg. The curves must not cross the lines of the gain and phase
+            margins.
     """
     figure = Figure(figsize=(8.0, 5.5), layout="constrained")
     axes = figure.subplots()
@@ -63,9 +67,13 @@ def nichols(L: np.ndarray, names: Sequence[str], limits: Mapping[str, float] = N
 
 @styled
 def sensitivity(w: np.ndarray, L: np.ndarray, names: Sequence[str], limits: Mapping[str, float] = NO_LIMITS) -> Figure:
-    """Plot |S| = |1 / (1 + L)| and |T| = |L / (1 + L)| over the frequency w [rad/s]; L (points, axes).
+    """Plot |S| = |1 / (1 + L)| and |T| = |L / (1 + L)| over the frequency.
 
-    `limits` are the required margins by name.
+    Args:
+        w: frequencies in ascending order, (frequencies,) [rad/s].
+        L: open-loop transfer function of each axis, complex (frequencies, axes) [-].
+        names: names of the axes.
+        limits: required margins by name. The limit of `peak_sensitivity` [dB] is drawn.
     """
     figure = Figure(figsize=(8.0, 4.5), layout="constrained")
     axes = figure.subplots()

@@ -60,7 +60,14 @@ def run_figures(
 
 
 def state(parts: Parts, log: Log, chart: Chart, title: str | None = None) -> Figure:
-    """Plot components of the plant's state over time, and the reference if the chart has one."""
+    """Plot components of the plant's state over time, and the reference if the chart has one.
+
+    Args:
+        parts: parts of the run.
+        log: history of the run, NumPy arrays (time, component).
+        chart: the components to plot, one of `parts.plant.charts`.
+        title: title of the figure; None: the title of the chart.
+    """
     figure, axes = new_figure(title or chart.title, chart.label)
     _plot_components(axes, log.t, parts.plant.columns(log.x)[chart.column], chart.column)
     if chart.with_reference:
@@ -73,7 +80,14 @@ def state(parts: Parts, log: Log, chart: Chart, title: str | None = None) -> Fig
 def error(
     parts: Parts, log: Log, limits: Mapping[str, float] = NO_LIMITS, lower_bound: LowerBound | None = None
 ) -> Figure:
-    """Plot the error's 2-norm on a log scale, with its bounds, its limits and the window of window_error."""
+    """Plot the error's 2-norm on a log scale, with its bounds, its limits and the window of window_error.
+
+    Args:
+        parts: parts of the run.
+        log: history of the run, NumPy arrays (time, component).
+        limits: required limits by metric, in the unit of the metric.
+        lower_bound: lower bound of the error over time; None: it is not drawn.
+    """
     if plant_kind(parts) == "spacecraft":
         convert, name, unit = error_display("spacecraft")
         figure, axes = new_figure(name.capitalize(), with_unit(name, unit))
@@ -103,9 +117,15 @@ def plant_kind(parts: Parts) -> str:
 
 
 def draw_error_limits(axes: Axes, parts: Parts, limits: Mapping[str, float], t_end: float) -> None:
-    """Draw the required limits of the error, each over the interval that it limits; `limits`: see `run_figures`.
+    """Draw the required limits of the error, each over the interval that it limits.
 
     Limits of pointing indices are not drawn: they limit the error about one axis or of the boresight.
+
+    Args:
+        axes: axes with the time [s] and the error in the unit of `metric_display`.
+        parts: parts of the run.
+        limits: required limits by metric, in the unit of the metric.
+        t_end: end of the last interval [s].
     """
     t_f = float(parts.controller.t_f)
     intervals = {"terminal": (t_f, t_f), "window": (t_f, t_f + float(parts.window)), "hold": (t_f, t_end)}
@@ -119,7 +139,14 @@ def draw_error_limits(axes: Axes, parts: Parts, limits: Mapping[str, float], t_e
 
 
 def torque(parts: Parts, log: Log, limits: Mapping[str, float] = NO_LIMITS, title: str | None = None) -> Figure:
-    """Plot the delivered input over time, with its largest value and its limits."""
+    """Plot the delivered input over time, with its largest value and its limits.
+
+    Args:
+        parts: parts of the run.
+        log: history of the run, NumPy arrays (time, component).
+        limits: required limits by metric, in the unit of the metric.
+        title: title of the figure; None: "Control".
+    """
     unit = f" {parts.plant.input_unit}".rstrip()
     figure, axes = new_figure(title or "Control", with_unit(parts.plant.input_name, parts.plant.input_unit))
     _plot_components(axes, log.t, log.u, "u", drawstyle="steps-post" if parts.clock.sampled else "default")
@@ -185,7 +212,13 @@ def sliding(parts: Parts, log: Log) -> Figure:
 
 
 def convergence(parts: Parts, log: Log, title: str = "Convergence") -> Figure:
-    """Plot error and s against time to go on log axes, with the exact motion and the theoretical slopes."""
+    """Plot error and s against time to go on log axes, with the exact motion and the theoretical slopes.
+
+    Args:
+        parts: parts of the run.
+        log: history of the run, NumPy arrays (time, component).
+        title: title of the figure.
+    """
     symbol = parts.controller.kinematics.symbol
     law, n = parts.controller, parts.controller.order
     t_f, eta, delta = float(law.t_f), float(law.eta), float(law.delta)
