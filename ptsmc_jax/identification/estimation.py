@@ -347,7 +347,17 @@ class Search:
         return jax.tree.map(np.asarray, computed)
 
     def innovations(self, z: np.ndarray, log: PreparedLog, gate: float = np.inf) -> Innovations:
-        """Return the innovations of a log, as NumPy arrays."""
+        """Return the innovations of a log.
+
+        Args:
+            z: coordinates of the parameters (n,) [-].
+            log: rows and structure of the log.
+            gate: a group of readings whose normalised square exceeds this number times its size is rejected as an
+                outlier.
+
+        Returns:
+            The innovations, NumPy arrays (rows - 1, components).
+        """
         rows, kind = log
         noise = jnp.asarray(self.acceleration_noise)
         computed = self._jitted_innovations(jnp.asarray(z), noise, _to_jax(rows), gate, kind=kind)

@@ -84,10 +84,15 @@ class FilterState(NamedTuple):
 
 
 def make_rows(log: Measurements, step: float, bucket: int = 1) -> Rows:
-    """Return a log as rows for the filter. Intervals longer than `step` [s] are divided into several rows.
+    """Return a log as rows for the filter. Long intervals are divided into several rows.
 
-    The rows are padded to a multiple of `bucket`, so that logs of similar lengths share a program. RefusedError is
-    raised for a log that needs too many steps.
+    Args:
+        log: the measurements.
+        step: largest integration step [s].
+        bucket: the rows are padded to a multiple of this number, so that logs of similar lengths share a program.
+
+    Raises:
+        RefusedError: the log needs more than `MAX_STEPS` steps.
     """
     step_counts = np.maximum(1, np.ceil(np.diff(log.t) / step * (1.0 - 1e-9)).astype(int))
     if step_counts.sum() > MAX_STEPS:
@@ -137,10 +142,19 @@ def _estimate_start_rate(log: Measurements) -> np.ndarray:
 
 
 def acting_command(model: Model, rows: Rows, wheel_inertia: float | None) -> Array:
-    """Return the mean of the delayed command over each interval, (rows, channels).
+    """Return the mean of the delayed command over each interval.
 
     The mean has the same impulse as the command, which may change within the interval. No command acts before the first
     row. If the log has wheel speeds, the command is the torque of the wheels on the body.
+
+    Args:
+        model: the model, whose delay acts on the command.
+        rows: the log as rows.
+        wheel_inertia: inertia of a wheel about its axis [kg m^2] if the command of the log is the wheel speeds [rad/s];
+            None for torques.
+
+    Returns:
+        The mean (rows, channels), for a spacecraft in N m.
     """
     if wheel_inertia is not None:
         change = jnp.append(jnp.diff(rows.command, axis=0), jnp.zeros((1, rows.command.shape[1])), axis=0)
@@ -198,6 +212,9 @@ def run_filter(
         gate: a group of readings whose normalised square exceeds this number times its size is rejected.
         with_track: whether the estimates are returned as well. They need memory for a covariance of each row.
         covariance_derivatives: whether derivatives of the innovations include those of the predicted covariance.
+
+    Returns:
+        The innovations, (rows - 1, components), and the states of the filter at all rows but the first, or None.
     """
     model = use_wheel_speeds(model, kind.wheel_inertia)
     acting = acting_command(model, rows, kind.wheel_inertia)
