@@ -128,6 +128,9 @@ class Law(declare.Tunable):
             t: times at which the periods begin [s].
             t_next: times at which they end [s].
             hold: whether each period begins in the hold phase.
+
+        Returns:
+            A bool for each period, in the shape of `t`.
         """
         return hold
 

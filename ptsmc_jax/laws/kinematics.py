@@ -84,6 +84,9 @@ class Kinematics:
             start: state and target at the start.
             end: state and target at the end.
             dt: length of the interval [s].
+
+        Returns:
+            The angle [rad], or |x_1| for other plants in their unit.
         """
         return guards.norm(integrators.hermite_middle(*self.errors(*start), *self.errors(*end), dt))
 
