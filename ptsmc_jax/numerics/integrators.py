@@ -68,6 +68,9 @@ def hermite_middle(start: Array, start_rate: Array, end: Array, end_rate: Array,
         end: value at the end.
         end_rate: its time derivative at the end [1/s].
         dt: length of the step [s].
+
+    Returns:
+        The value, in the shape and unit of `start`.
     """
     return (start + end) / 2 + dt / 8 * (start_rate - end_rate)
 

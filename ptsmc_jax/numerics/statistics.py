@@ -47,6 +47,9 @@ def fraction_bound(successes: int, trials: int, confidence: float) -> float:
         successes: number k of trials that succeed.
         trials: number of trials.
         confidence: smallest coverage probability of the bound [-].
+
+    Returns:
+        The bound, from 0 to 1 [-].
     """
     return float(special.betaincinv(successes, trials - successes + 1, 1.0 - confidence)) if successes > 0 else 0.0
 
@@ -333,6 +336,9 @@ def most_extreme(values: np.ndarray, failed: np.ndarray, count: int, *, larger_i
         failed: whether each trial failed, (trials,).
         count: how many indices.
         larger_is_better: sort the smallest values first instead of the largest.
+
+    Returns:
+        Indices of at most `count` trials, the worst first.
     """
     badness = values if larger_is_better else -values
     return np.lexsort((badness, ~np.isnan(values), ~failed))[:count]
