@@ -93,6 +93,9 @@ class Observer(declare.Tunable, ABC):
             span: begin and end of the step [s].
             memory: memory m of the observer.
             d_eff: disturbance of the design model, (m,) [N m].
+
+        Returns:
+            A pytree like `memory`, in its unit per second.
         """
         raise NotImplementedError
 
@@ -110,6 +113,9 @@ class Observer(declare.Tunable, ABC):
             impulse: integral of d_eff over the period, from `Plant.implied_disturbance_impulse`, (m,) [N m s].
             t: end of the period [s].
             dt: length of the period [s], which may be 0.
+
+        Returns:
+            The memory, a pytree like `memory`.
         """
 
     def fastest(self) -> float:
@@ -138,6 +144,9 @@ class SampledObserver(Observer):
             d_mean: mean measured disturbance in the period, (m,) [N m]. It includes model errors and sensor noise.
             t: end of the period [s].
             dt: length of the period [s].
+
+        Returns:
+            The memory, a pytree like `memory` with the same shapes and dtypes.
         """
         raise NotImplementedError
 
