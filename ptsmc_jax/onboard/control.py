@@ -62,12 +62,12 @@ def translate_cond(translator: "Translator", eqn: JaxprEqn, values: list[np.ndar
     """Translate lax.cond and lax.switch: C runs one of the branches.
 
     Args:
-        translator: the translator.
-        eqn: the equation of the jaxpr.
-        values: components of its inputs.
+        translator: translator of the whole jaxpr, which also translates the branches.
+        eqn: equation of the jaxpr.
+        values: the nodes of each input, an object array in the shape of the input.
 
     Returns:
-        The components of its outputs.
+        The nodes of each output, an object array in the shape of the output.
     """
     index, *operands = values
     branches, test = eqn.params["branches"], index.item()
@@ -93,7 +93,16 @@ def translate_cond(translator: "Translator", eqn: JaxprEqn, values: list[np.ndar
 
 
 def translate_while(translator: "Translator", eqn: JaxprEqn, values: list[np.ndarray]) -> list[np.ndarray]:
-    """Translate lax.while_loop; see `translate_cond` for arguments and result."""
+    """Translate lax.while_loop to a loop in C.
+
+    Args:
+        translator: translator of the whole jaxpr, which also translates the test and body.
+        eqn: equation of the jaxpr.
+        values: the nodes of each input, an object array in the shape of the input.
+
+    Returns:
+        The nodes of each output, an object array in the shape of the output.
+    """
     test, body, test_consts, body_consts, init = unpack_while(eqn, values)
     region = Region("while")
     carry = _begin_loop(translator, region, init, eqn.outvars)
@@ -105,7 +114,13 @@ def translate_while(translator: "Translator", eqn: JaxprEqn, values: list[np.nda
 def translate_scan(translator: Any, eqn: Any, values: list[np.ndarray]) -> list[np.ndarray]:
     """Translate lax.scan and fori_loop of fixed length: unrolled if short, otherwise a loop in C.
 
-    See `translate_cond` for arguments and result.
+    Args:
+        translator: translator of the whole jaxpr, which also translates the body.
+        eqn: equation of the jaxpr.
+        values: the nodes of each input, an object array in the shape of the input.
+
+    Returns:
+        The nodes of each output, an object array in the shape of the output.
     """
     params = eqn.params
     body, length = params["jaxpr"], params["length"]

@@ -38,6 +38,15 @@ class Node:
     created: ClassVar[int] = 0
 
     def __init__(self, op: str, args: tuple["Node", ...], kind: str, value: Any, block: "Block"):
+        """Make a node. Only `Pool` calls this method.
+
+        Args:
+            op: name of the operation, or "constant", "place", "variable", "index" or "table".
+            args: the operands.
+            kind: kind of the value: `REAL`, `BOOL` or an integer type of C.
+            value: number of a constant, C expression of a place, or further data of the operation.
+            block: block of statements that computes the value.
+        """
         Node.created += 1
         self.serial = Node.created  # in the order of creation: operands have smaller numbers
         self.op, self.args, self.kind, self.value, self.block = op, args, kind, value, block

@@ -37,7 +37,16 @@ class Field:
 
     @classmethod
     def of_leaf(cls, name: str, leaf: Any, meaning: str) -> "Field":
-        """Return the field of a leaf with a shape and a dtype. Raises NoRuleError if the dtype has no C type."""
+        """Return the field of a leaf of a pytree.
+
+        Args:
+            name: name of the field in C.
+            leaf: array, or its shape and dtype.
+            meaning: comment on the field in C.
+
+        Raises:
+            NoRuleError: the dtype has no type in C.
+        """
         kind = kind_of(leaf.dtype)
         if not kind:
             raise NoRuleError(f"{name} has the type {leaf.dtype}, but must have one of the types {', '.join(KINDS)}")

@@ -29,7 +29,17 @@ class Controller:
     """The flight computer of a scenario, in C."""
 
     def __init__(self, scenario: Scenario, name: str, source: str, reference_input: bool = False):
-        """Trace the flight computer. Raises ScenarioError if it cannot be written in C."""
+        """Trace the flight computer of a scenario and translate it to C.
+
+        Args:
+            scenario: a scenario with a sampled loop; the C uses its flight clock.
+            name: name of the controller, a C identifier.
+            source: name of the scenario's file, for comments.
+            reference_input: whether the reference is an input of the C, instead of a part of it.
+
+        Raises:
+            ScenarioError: the flight computer cannot be written in C.
+        """
         self.scenario = on_flight_clock(scenario)
         self.ready: Study = scenarios.study(self.scenario)
         self.reference_input = reference_input  # whether the reference is an input

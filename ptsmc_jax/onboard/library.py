@@ -69,7 +69,16 @@ class Library:
     """A compiled controller. Its `parameters` begin with the values of its folder and may be changed."""
 
     def __init__(self, folder: str | Path, real: str = "double", options: tuple[str, ...] = ()):
-        """Compile a folder. Raises ScenarioError if it is not a controller or does not compile."""
+        """Compile and load a controller.
+
+        Args:
+            folder: folder that `ptsmc export` has written.
+            real: type of real numbers in C, "double" or "float".
+            options: further options of the C compiler.
+
+        Raises:
+            ScenarioError: the folder is not a controller, does not compile, or does not load.
+        """
         self.folder = Path(folder)
         invalid = ScenarioError(f"the controller is {self.folder}, but must be a folder that ptsmc export has written")
         try:
@@ -155,7 +164,16 @@ class InTheLoop:
     """
 
     def __init__(self, library: Library, parts: Parts, dispersion: Dispersion | None = None):
-        """Check the controller. Raises ScenarioError if it has other parts, or cannot have the dispersions."""
+        """Check that a controller and the parts of a simulation belong together.
+
+        Args:
+            library: the compiled controller.
+            parts: nominal parts of the simulation.
+            dispersion: dispersions of the simulation; None: there are none.
+
+        Raises:
+            ScenarioError: the controller is for other parts, or its parameters cannot have the dispersions.
+        """
         self.library, self.board, self.nominal = library, build_board(parts, library.reference_input), parts
         board_columns = column_names(self.board)
         for kind, noun in (("in", "inputs"), ("out", "outputs"), ("state", "state")):
