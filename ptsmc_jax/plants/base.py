@@ -75,24 +75,74 @@ class Plant(ABC):
 
     @abstractmethod
     def generalised_force(self, t: Scalar, x: State, u: Float[Array, " m"]) -> Float[Array, " m"]:
-        """Return the force f(t, x, u)."""
+        """Return the force f(t, x, u).
+
+        Args:
+            t: time [s].
+            x: state.
+            u: input (m,).
+
+        Returns:
+            The force (m,), in the unit of the inputs.
+        """
 
     @abstractmethod
     def rate(self, t: Scalar, x: State, u: Float[Array, " m"], disturbance: Float[Array, " m"]) -> State:
-        """Return the time derivative of the state."""
+        """Return the time derivative of the state.
+
+        Args:
+            t: time [s].
+            x: state.
+            u: input (m,).
+            disturbance: disturbance d (m,).
+
+        Returns:
+            A pytree like `x`, with the unit of each state per second.
+        """
 
     @abstractmethod
     def input_for(self, t: Scalar, x: State, w_dot: Float[Array, " m"], d: Float[Array, " m"]) -> Float[Array, " m"]:
-        """Return the input for this w' and disturbance d."""
+        """Return the input for this w' and disturbance d.
+
+        Args:
+            t: time [s].
+            x: state.
+            w_dot: derivative w' of the velocity (m,), [rad/s^2] for a spacecraft.
+            d: disturbance (m,).
+
+        Returns:
+            The input (m,).
+        """
 
     def implied_disturbance(self, t: Scalar, x: State, x_dot: State, u: Float[Array, " m"]) -> Float[Array, " m"]:
-        """Return the disturbance M w' - f(t, x, u) that explains a motion with the state derivative `x_dot`."""
+        """Return the disturbance M w' - f(t, x, u) that explains a motion with the state derivative `x_dot`.
+
+        Args:
+            t: time [s].
+            x: state.
+            x_dot: time derivative of the state, a pytree like `x`.
+            u: input (m,).
+
+        Returns:
+            The disturbance (m,), in the unit of the inputs.
+        """
         return self.mass(t, x) @ self.velocity(x_dot) - self.generalised_force(t, x, u)
 
     def implied_disturbance_impulse(
         self, t: Scalar, x: State, x_next: State, u: Float[Array, " m"], dt: Scalar
     ) -> Float[Array, " m"]:
-        """Return the integral of `implied_disturbance` over a period dt [s] that ends at t, by the trapezium rule."""
+        """Return the integral of `implied_disturbance` over a period, by the trapezium rule.
+
+        Args:
+            t: time at the end of the period [s].
+            x: state at the start of the period.
+            x_next: state at the end of the period.
+            u: input (m,), constant in the period.
+            dt: length of the period [s].
+
+        Returns:
+            The impulse (m,), in the unit of the inputs times s.
+        """
         before = t - dt
         force = 0.5 * (self.generalised_force(before, x, u) + self.generalised_force(t, x_next, u))
         mass = 0.5 * (self.mass(before, x) + self.mass(t, x_next))

@@ -82,7 +82,13 @@ class System(Plant):
         return one if self.D is None else matrices.solve(self.disturbance_gain(t, x), one)
 
     def undisturbed_rate(self, t: Scalar, x: Float[Array, " twice"], u: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Return H + G u, which is x_2' without the disturbance."""
+        """Return H + G u (n,), which is x_2' without the disturbance.
+
+        Args:
+            t: time [s].
+            x: state (2n,), or with hidden states (2n + k,).
+            u: input (n,).
+        """
         return self.drift(t, x) + self.input_gain(t, x) @ u
 
     def generalised_force(self, t: Scalar, x: Float[Array, " twice"], u: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -98,7 +104,16 @@ class System(Plant):
         return jnp.concatenate([self.position_rate(t, x), x_2_dot, *self.hidden_rates(t, x, u)])
 
     def hidden_rates(self, t: Scalar, x: Float[Array, " twice"], u: Float[Array, " n"]) -> tuple[Array, ...]:
-        """Return the derivatives of the hidden states, which this plant does not have."""
+        """Return the derivatives of the hidden states, which this plant does not have.
+
+        Args:
+            t: time [s].
+            x: state (2n,), or with hidden states (2n + k,).
+            u: input (n,).
+
+        Returns:
+            A tuple with the array z' (k,), empty without hidden states.
+        """
         return ()
 
     def input_for(
@@ -113,7 +128,16 @@ class System(Plant):
         return guards.norm(self.velocity(x))
 
     def jacobian(self, t: Scalar, x: Float[Array, " twice"], u: Float[Array, " n"]) -> Float[Array, "twice twice"]:
-        """Return dx'/dx at a constant input. Integration steps must resolve its eigenvalues [1/s]."""
+        """Return dx'/dx at a constant input. Integration steps must resolve its eigenvalues [1/s].
+
+        Args:
+            t: time [s].
+            x: state (2n,), or with hidden states (2n + k,).
+            u: input (n,).
+
+        Returns:
+            The matrix (2n, 2n), or (2n + k, 2n + k) with hidden states.
+        """
         return jax.jacfwd(lambda x: self.rate(t, x, u, jnp.zeros(self.inputs)))(x)
 
     def columns(self, x: Array | np.ndarray) -> dict[str, ArrayLike]:
