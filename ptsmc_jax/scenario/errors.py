@@ -53,7 +53,13 @@ def value_error(key: str, value: object, reason: str, allowed: str = "") -> Scen
 
 
 def list_of(count: int, each: str, entry: str = "number") -> str:
-    """Return the text of a list of fixed length, such as "a list of 3 numbers, one for each axis"."""
+    """Return the text of a list of fixed length, such as "a list of 3 numbers, one for each axis".
+
+    Args:
+        count: length of the list.
+        each: noun for what each entry belongs to, such as "axis".
+        entry: noun for an entry.
+    """
     if count == 1:
         return f"a list with one {entry}, since there is one {each}"
     return f"a list of {count} {entry}s, one for each {each}"

@@ -234,6 +234,9 @@ def widen_bounds(
         scenario: scenario whose bounds were searched.
         sides: "lower" or "upper" for each gain on a bound, by its name.
         defaulted: paths of the keys that the user's scenario leaves out.
+
+    Returns:
+        Lower and upper bound of each gain whose bounds move, in the unit of the gain.
     """
     bounds, wider = scenario.search.bounds, dict[str, tuple[float, float]]()
     for name, side in sides.items():

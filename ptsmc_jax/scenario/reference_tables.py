@@ -52,9 +52,15 @@ class ReferenceTable(PartTable, frozen=True):
         """Raise ScenarioError if keys are not valid, or contradict other tables."""
 
     def check_reference_until(self, scenario: "SpacecraftScenario", last: float, key: str) -> None:
-        """Raise ScenarioError if the reference ends before the time `last` [s], at which a run ends.
+        """Raise an error if the reference ends before a run ends.
 
-        key: the key of the scenario that sets this time, for the error.
+        Args:
+            scenario: the scenario with this table.
+            last: end of the run [s].
+            key: key of the scenario that sets `last`, for the error.
+
+        Raises:
+            ScenarioError: the reference ends earlier.
         """
 
     def build(self, scenario: "SpacecraftScenario") -> references.Reference:
@@ -302,7 +308,13 @@ class DirectionsTable(MissionTable, frozen=True):
     def numpy_part(
         self, mission: Mission, anchors: np.ndarray = IDENTITY[None], rate: float = 0.0
     ) -> orbits.TwoVectorReference:
-        """Build the reference with NumPy numbers."""
+        """Build the reference with NumPy numbers.
+
+        Args:
+            mission: orbit and epoch of the scenario.
+            anchors: quaternions of the frame (n, 4) at equal intervals, see `TwoVectorReference`.
+            rate: number of anchors per second [1/s].
+        """
         primary, secondary = self.directions(mission)
         needs_orbit = any(isinstance(one, orbits.OrbitDirection | orbits.GroundPoint) for one in (primary, secondary))
         return self.part_class(

@@ -85,7 +85,15 @@ def make_table(
 def extend_table(
     base: type[PartTable], part_class: type, kind: str, declared: Mapping[str, Declaration], body: bool
 ) -> Any:
-    """Return a subclass of a table with declared keys; the arguments are those of `make_table`."""
+    """Return a subclass of a table with declared keys.
+
+    Args:
+        base: the table with the keys that all these parts share.
+        part_class: the class of the part; the first paragraph of its docstring describes the kind.
+        kind: name of the kind.
+        declared: declarations of the added keys by name, see `declare`.
+        body: whether the plant is a spacecraft.
+    """
     fields: list[tuple[str, Any, Any]] = [("kind", Literal[kind], kind)]
     for name, declaration in declared.items():
         scaled = declaration.default is None or isinstance(declaration.default, Scaled)
