@@ -157,7 +157,13 @@ def mean_anomaly(true_anomaly: float, eccentricity: float) -> float:
 
 
 def ground_point(latitude: float, longitude: float, height: float) -> np.ndarray:
-    """Return Earth-fixed coordinates (3,) [m] of geodetic latitude and longitude [rad] and height [m] on WGS-84."""
+    """Return the Earth-fixed coordinates (3,) [m] of a point near the ground.
+
+    Args:
+        latitude: geodetic latitude on WGS-84 [rad].
+        longitude: longitude, positive to the east [rad].
+        height: height above the ellipsoid [m].
+    """
     eccentricity_squared = FLATTENING * (2.0 - FLATTENING)  # square of the first eccentricity
     normal = EQUATORIAL_RADIUS / np.sqrt(1.0 - eccentricity_squared * np.sin(latitude) ** 2)
     equatorial = (normal + height) * np.cos(latitude)
