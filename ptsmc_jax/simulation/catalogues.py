@@ -96,6 +96,14 @@ def as_angle(metric: str, unit: str, value: Any) -> tuple[str, Any]:
     """Return the unit and the value of a metric. A norm |v| of an attitude error becomes the angle 2 asin |v| [rad].
 
     Texts and figures show these angles. Files have the metrics themselves.
+
+    Args:
+        metric: name of the metric.
+        unit: unit of `value`.
+        value: value or values of the metric, in any shape.
+
+    Returns:
+        "rad" and the angle, in the shape of `value`. For a metric that is no such norm, `unit` and `value`.
     """
     return ("rad", pointing_angle(value)) if metric in ANGLE_METRICS and unit == "-" else (unit, value)
 

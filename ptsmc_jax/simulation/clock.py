@@ -124,9 +124,14 @@ class Graded:
         return _full_intervals(t, t_next, hold)
 
     def is_too_coarse(self, t_f: Any, delta: Any, xp: ModuleType = jnp) -> Any:
-        """Return whether steps are longer than `LARGEST_STEP_FRACTION` allows; t_f and delta in s.
+        """Return whether steps are longer than `LARGEST_STEP_FRACTION` allows.
 
         This happens, for example, if t_f is twice the t_f that the grid was built for.
+
+        Args:
+            t_f: prescribed time [s].
+            delta: time from the hand-over to t_f [s].
+            xp: JAX's or NumPy's functions.
         """
         return self._grading_weight(t_f, delta, xp) < 1.0 / LARGEST_STEP_FRACTION
 
@@ -207,7 +212,16 @@ def graded_steps(
     layer: tuple[float, float],
     order: int,
 ) -> tuple[float, float, float]:
-    """Return the steps of `graded_clock`, see there for the arguments.
+    """Return the steps of `graded_clock`.
+
+    Args:
+        t_f: prescribed time [s].
+        delta: time from the hand-over to t_f [s].
+        t_end: end of the run [s].
+        hold_rate: fastest decay after the hand-over [1/s].
+        frequency: fastest angular frequency [rad/s].
+        layer: fastest rates in the boundary layer before and after the hand-over [1/s].
+        order: order of a chain, otherwise 1.
 
     Returns:
         The number of steps before and after the hand-over, not rounded up and perhaps infinite, and the largest step

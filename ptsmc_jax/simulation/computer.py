@@ -80,7 +80,15 @@ class Software(NamedTuple):
 
 
 def boot(parts: Parts, seed: WholeNumber, trial: WholeNumber, x0: PyTree, first: Ticks) -> Computer:
-    """Return the memory before the first sample. x0 is the true initial state, as far as sensors can measure it."""
+    """Return the memory of the flight computer before the first sample.
+
+    Args:
+        parts: parts of the run.
+        seed: seed of the noise, a whole number.
+        trial: number of the trial.
+        x0: true initial state, as far as sensors can measure it.
+        first: the first control period.
+    """
     sensors = parts.sensors.begin(seed, trial, x0, first)
     zero = jnp.zeros(parts.plant.inputs)
     applied = zero, None if parts.actuators.wheels is None else zero
@@ -89,7 +97,17 @@ def boot(parts: Parts, seed: WholeNumber, trial: WholeNumber, x0: PyTree, first:
 
 
 def estimate(parts: Parts, period: Period, computer: Computer, seen: PyTree) -> tuple[Array, PyTree]:
-    """Return the disturbance (m,) [N m], estimated from the change of the state in the last period, and the memory."""
+    """Estimate the disturbance from the change of the measured state in the last period.
+
+    Args:
+        parts: parts of the run.
+        period: the control period that begins.
+        computer: memory of the flight computer from the period before.
+        seen: measured state at the sample.
+
+    Returns:
+        The disturbance (m,), for a spacecraft in N m, and the memory of the observer for the next sample.
+    """
     observer, model, dt = parts.observer, parts.observer.model, period.dt_before
     assert computer.applied is not None
     torque, wheel_momentum = computer.applied

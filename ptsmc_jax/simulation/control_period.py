@@ -241,7 +241,14 @@ def star_state(parts: Parts, now: Ticks, x_after: Callable[[Scalar], PyTree]) ->
 
 
 def period_torques(actuators: Actuators, drive: Drive, u: Array, dt: Scalar) -> Torques:
-    """Return commanded and delivered torques of a control period of dt [s], and the momentum of the wheels in it."""
+    """Return commanded and delivered torques of a control period, and the momentum of the wheels in it.
+
+    Args:
+        actuators: the actuators.
+        drive: input of the actuators in the period.
+        u: command of the law (m,) [N m].
+        dt: length of the control period [s].
+    """
     wheels = actuators.wheels is not None
     # with a lag the torque may change its sign within the period, where the wheels' momentum may then peak
     times = (jnp.zeros_like(dt), dt / 2, dt) if actuators.has_dynamics or wheels else (jnp.zeros_like(dt),)

@@ -385,7 +385,13 @@ def begin(start: Start, criteria: Criteria) -> Running:
 
 
 def update(running: Running, interval: Interval, criteria: Criteria) -> Running:
-    """Return the accumulators after one more interval. An interval of length zero changes nothing."""
+    """Return the accumulators after one more interval. An interval of length zero changes nothing.
+
+    Args:
+        running: accumulators before the interval.
+        interval: the interval, with the true states at its ends.
+        criteria: times [s], settling angle [rad] and observation of pointing errors that the metrics refer to.
+    """
     has_length, old = interval.length > 0.0, running.memories
     updated = {
         name: metric.update(old[name], interval, criteria)

@@ -168,13 +168,28 @@ class ConstantPath(NamedTuple):
 
 
 def hermite_path(start: Array, start_rate: Array, end: Array, end_rate: Array, length: Scalar) -> ErrorPath:
-    """Return the cubic Hermite path between two errors (5,) [rad] with these rates [rad/s], over a length [s]."""
+    """Return the cubic Hermite path between two errors with these rates.
+
+    Args:
+        start: error at the start (5,) [rad].
+        start_rate: rate of the error at the start (5,) [rad/s].
+        end: error at the end (5,) [rad].
+        end_rate: rate of the error at the end (5,) [rad/s].
+        length: length of the interval [s].
+    """
     rise = end - start
     return ErrorPath(start, end, rise, length * start_rate - rise, rise - length * end_rate, length)
 
 
 def error_path(start: tuple, end: tuple, frame: Float[Array, "3 3"], length: Scalar) -> ErrorPath:
-    """Return the path of the attitude error between two pairs (state, target), over an interval of a length [s]."""
+    """Return the path of the attitude error over an interval.
+
+    Args:
+        start: state of the body and target of the reference at the start of the interval.
+        end: state and target at the end of the interval.
+        frame: boresight and two directions across it in body axes, (3, 3), see `boresight_frame`.
+        length: length of the interval [s].
+    """
 
     def error_and_rate(x: AttitudeState, target: Target) -> tuple[Array, Array]:
         rates = attitude.derivative(x.q, x.w), attitude.derivative(target.q, target.w)
@@ -186,7 +201,14 @@ def error_path(start: tuple, end: tuple, frame: Float[Array, "3 3"], length: Sca
 def constant_path(
     q: Float[Array, "4"], true: Float[Array, "4"], frame: Float[Array, "3 3"], length: Scalar
 ) -> ConstantPath:
-    """Return the error of a measured quaternion from the true one. It is constant until the next sample."""
+    """Return the error of a measured quaternion from the true one. It is constant until the next sample.
+
+    Args:
+        q: measured unit quaternion.
+        true: true unit quaternion.
+        frame: boresight and two directions across it in body axes, (3, 3), see `boresight_frame`.
+        length: length of the interval [s].
+    """
     return ConstantPath(attitude_error(q, true, frame), length)
 
 
@@ -198,7 +220,13 @@ class Segments(NamedTuple):
     filled: Array  # number of filled segments
 
     def with_segment(self, start: Array, end: Array, length: Scalar) -> "Segments":
-        """Append a segment. If no space is left, it is dropped and `filled` exceeds the number of places."""
+        """Append a segment. If no space is left, it is dropped and `filled` exceeds the number of places.
+
+        Args:
+            start: error at the start of the segment (5,) [rad].
+            end: error at the end of the segment (5,) [rad].
+            length: length of the segment [s].
+        """
         return Segments(
             self.ends.at[self.filled].set(jnp.stack([start, end])),
             self.lengths.at[self.filled].set(length),
@@ -418,7 +446,16 @@ def update_errors(
 
 
 def metric_values(errors: PointingErrors, observation: Pointing, length: Array) -> dict[str, Array]:
-    """Return the pointing metrics by name, for an observation of a length [s]."""
+    """Return the pointing metrics by name.
+
+    Args:
+        errors: accumulators at the end of the run.
+        observation: the observation.
+        length: length of the observation [s].
+
+    Returns:
+        Scalars: the largest value of each index [rad], and the fractions of the time within each limit [-].
+    """
     indices = _index_values(errors.attitude, ATTITUDE, observation, length) | {"pde": drift(errors.attitude)}
     if errors.knowledge is not None:
         indices |= _index_values(errors.knowledge, KNOWLEDGE, observation, length)

@@ -55,6 +55,14 @@ def violation_ratio(values: Any, limit: Any, *, at_least: bool) -> Any:
 
     If values must be at least the limit, the ratio is 2 - value / limit, and 0 for an infinite value. For a limit of
     zero it is 0 if the limit is kept, and above 1 otherwise.
+
+    Args:
+        values: values of the metric or margin, in any shape.
+        limit: limit of the requirement, in the same unit.
+        at_least: whether the limit is the smallest allowed value; otherwise it is the largest.
+
+    Returns:
+        The ratios [-], in the shape of `values`.
     """
     zero = limit == 0.0
     with np.errstate(over="ignore"):
