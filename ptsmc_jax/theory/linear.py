@@ -265,9 +265,17 @@ def linearise_periods(
 
 
 def map_in_batches(function: Callable[[Any], Any], items: Any, size: int) -> Any:
-    """Apply a compiled function to batches of items and return NumPy arrays, with the items along the first axis.
+    """Apply a compiled function to batches of items.
 
-    All batches have `size` items, so that JAX does not compile a program for each number of items.
+    All batches have the same number of items, so that JAX does not compile a program for each number of items.
+
+    Args:
+        function: the compiled function of a pytree of arrays (size, ..).
+        items: pytree of arrays (items, ..).
+        size: number of items in a batch. The last batch repeats items to reach it.
+
+    Returns:
+        The results of all items, a pytree of NumPy arrays (items, ..).
     """
     count = np.shape(jax.tree.leaves(items)[0])[0]
 

@@ -109,6 +109,9 @@ def window_error(parts: Parts, ticks: Ticks, squares: np.ndarray) -> float:
         parts: the scenario.
         ticks: control periods of the run.
         squares: mean squares of the error at start, middle and end of each period, (periods, 3).
+
+    Returns:
+        The RMS error, in the unit of `window_error`: [-] for a spacecraft.
     """
     times: Any = map(np.asarray, (parts.controller.t_f, parts.t_end, parts.window, parts.settling_angle))
     start, middle, end = squares.T

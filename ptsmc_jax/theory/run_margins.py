@@ -81,6 +81,9 @@ def find_period_indices(parts: Parts, run: linear.NominalRun, times: Array) -> A
         parts: the sampled scenario.
         run: its nominal run.
         times: times to go (times,) [s].
+
+    Returns:
+        Indices into the periods of `run`, (times + 1,). The last one is in the hold phase.
     """
     ticks, law = run.period.now, parts.controller
     full = linear.is_full(ticks, parts.period)
