@@ -89,7 +89,16 @@ VALUES = {
 
 
 def parse_traded_values(against: str, points: int | None, times: str | None, limits: str | None) -> tuple[float, ...]:
-    """Return the times of --times [s] or the limits of --limits [dB] in ascending order; --points is only checked.
+    """Check --points, --times and --limits, and return the times or the limits in ascending order.
+
+    Args:
+        against: the quantity to trade, a key of `VALUES`.
+        points: value of --points; None: it is absent.
+        times: value of --times: times in s, separated by commas; None: it is absent.
+        limits: value of --limits: limits in dB, separated by commas; None: it is absent.
+
+    Returns:
+        Times [s] or limits [dB]; empty if neither option is present.
 
     Raises:
         UsageError: an option does not belong to this quantity, or its values are not allowed.

@@ -47,7 +47,18 @@ def warn_about_seed(scenario: Path, seed: int) -> None:
 
 
 def run(search: LongSearch, loaded: "Scenario", folder: Path, *, force: bool, quiet: bool) -> int:
-    """Show a finished search, resume an interrupted one, or begin a new one. Returns the exit status."""
+    """Show a finished search, resume an interrupted one, or begin a new one.
+
+    Args:
+        search: the search to run.
+        loaded: the scenario.
+        folder: the result folder.
+        force: whether to begin a new search even if the folder has a finished or interrupted one.
+        quiet: whether to print nothing but warnings and errors.
+
+    Returns:
+        The exit status of the command, see `STATUS`.
+    """
     from ptsmc_jax.campaigns import store
     from ptsmc_jax.scenario import parsing, study
 
