@@ -248,7 +248,13 @@ def gain_table(scenario: dict[str, Any], plant: str) -> Table:
 
 
 def worst_trial_table(frame: "pl.DataFrame", by: str, units: Mapping[str, str]) -> Table:
-    """Return the table of the worst trials by a metric, the worst first; units: unit of each column."""
+    """Return the table of the worst trials by a metric, the worst first.
+
+    Args:
+        frame: rows of the worst trials, the worst first.
+        by: name of the metric that ranks them.
+        units: unit of each column by name.
+    """
     columns = ("trial", "status", by, "window_error", "peak_torque", "settling_time", "initial_angle")
     head, cells = [], []
     for name in catalogues.without_norms(name for name in columns if name in frame.columns):
@@ -262,7 +268,13 @@ def worst_trial_table(frame: "pl.DataFrame", by: str, units: Mapping[str, str]) 
 
 
 def replay_hint(frame: "pl.DataFrame", folder: Path, *, is_custom: bool) -> str:
-    """Return the command that replays the worst trial; is_custom: simulating it runs custom code."""
+    """Return a sentence with the command that replays the worst trial.
+
+    Args:
+        frame: rows of the worst trials, the worst first.
+        folder: folder of the campaign.
+        is_custom: whether simulating the trial runs custom code, which needs --trust.
+    """
     call = f"ptsmc replay {shlex.quote(str(folder))} --trial {frame['trial'][0]}" + (" --trust" if is_custom else "")
     return f"all columns are in {folder / 'worst.csv'}; replay one trial with {call}"
 

@@ -7,6 +7,11 @@ from collections.abc import Callable, Mapping
 def format_number(value: float | None, format_spec: str, none: str = "-") -> str:
     """Return a number in this format, or `none` for None and NaN.
 
+    Args:
+        value: the number.
+        format_spec: format as in f-strings, such as ".3g".
+        none: text for None and NaN.
+
     >>> format_number(0.12345, ".3g"), format_number(None, ".3g"), format_number(float("nan"), ".3g", "never")
     ('0.123', '-', 'never')
     """
@@ -92,6 +97,11 @@ def error_name(plant: str) -> str:
 def format_named_error(value: float | None, plant: str, statistic: str = "") -> str:
     """Return the window error with its name, empty if there is none.
 
+    Args:
+        value: window error, in the unit of the metric, or None.
+        plant: kind of the plant: "spacecraft", "chain" or "system".
+        statistic: text before the name, such as "RMS ".
+
     >>> format_named_error(1e-6, "spacecraft", "RMS "), format_named_error(None, "chain")
     ('RMS pointing error 0.413 arcsec', '')
     """
@@ -100,6 +110,11 @@ def format_named_error(value: float | None, plant: str, statistic: str = "") -> 
 
 def format_objective(name: str, value: float, plant: str) -> str:
     """Return an objective with its name and unit, a window error as a pointing angle.
+
+    Args:
+        name: name of the objective, such as "RMS window error".
+        value: value of the objective, in the unit of its metric, or in s for t_f.
+        plant: kind of the plant: "spacecraft", "chain" or "system".
 
     >>> format_objective("RMS window error", 1e-6, "spacecraft"), format_objective("t_f", 30.0, "chain")
     ('RMS pointing error 0.413 arcsec', 't_f 30 s')
@@ -128,7 +143,12 @@ def objective_metric(name: str, plant: str) -> str:
 
 
 def format_metric(value: float, metric: str, plant: str) -> str:
-    """Return a metric of this kind of plant with its unit.
+    """Return a metric with its unit. Attitude errors and angles are in arcsec or degrees.
+
+    Args:
+        value: value of the metric, in the unit of the metric.
+        metric: name of the metric.
+        plant: kind of the plant: "spacecraft", "chain" or "system".
 
     >>> format_metric(0.2813, "peak_torque", "spacecraft"), format_metric(1e-5, "window_error", "spacecraft")
     ('0.281 N m', '4.13 arcsec')
@@ -152,6 +172,11 @@ def heading(name: str, unit: str) -> str:
 
 def list_gains(gains: Mapping[str, float], units: Mapping[str, str], digits: str) -> str:
     """Return gains with their units in one line.
+
+    Args:
+        gains: values by name. A gain with several components has names such as observer_gain_1.
+        units: unit of each gain, by the name without the number of the component.
+        digits: format of each value, such as ".4g".
 
     >>> list_gains({"eta": 3.0, "observer_gain_1": 0.5}, {"eta": "-", "observer_gain": "N m s"}, ".4g")
     'eta 3, observer_gain_1 0.5 N m s'

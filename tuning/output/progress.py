@@ -110,7 +110,15 @@ class Progress(Bar):
         self._objective, self._plant = objective, plant
 
     def __call__(self, step: str, done: int, total: int, value: float = float("nan"), violation: float = 0.0) -> None:
-        """Report the current step, the number of steps done and in all, the best objective, and its violation."""
+        """Show the current step, its progress, and the best objective so far.
+
+        Args:
+            step: current step in words.
+            done: number of steps done.
+            total: number of steps in all; 0: unknown.
+            value: best objective so far; NaN: there is none.
+            violation: how far the best gains exceed a limit in training, relative to the limit [-].
+        """
         if (total or None) != self._bar.tasks[0].total:
             self._bar.reset(self._task, total=total or None)
         limits = "limits met in training" if violation == 0.0 else f"{format_ratio(100.0 * violation)} % beyond a limit"

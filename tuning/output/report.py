@@ -142,7 +142,16 @@ def per_cent_of_limit(entry: "Entry") -> str:
 
 
 def bound_lines(value: float | None, lower_bound: float | None, plant: str) -> Iterator[str]:
-    """Return the ratio of the RMS error of a campaign to its lower bound; nothing without a bound."""
+    """Yield a sentence with the ratio of the RMS error of a campaign to its lower bound.
+
+    Args:
+        value: RMS window error of the campaign, in the unit of the metric, or None.
+        lower_bound: lower bound of this error in the same unit, or None.
+        plant: kind of the plant: "spacecraft", "chain" or "system".
+
+    Yields:
+        The sentence, unless a number is None or 0.
+    """
     ratio = ratio_to_bound(value, lower_bound)
     if ratio is not None:
         yield f"{format_ratio(ratio)} times the lower bound of {format_error(lower_bound, plant)} with these sensors"
