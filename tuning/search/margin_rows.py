@@ -224,6 +224,9 @@ def constraints_on_devices(asked: RequiredMargins, scale: Scale, normalised: Arr
         asked: the required margins.
         scale: map from normalised gains to gains.
         normalised: (devices, gains) normalised gains.
+
+    Returns:
+        "c", (devices, margins, entries), and "c_gradient", (devices, margins, entries, gains).
     """
 
     def constraints_on_device(normalised: Array) -> dict[str, Array]:

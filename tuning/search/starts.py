@@ -204,5 +204,8 @@ def penalise(f: Any, largest_c: Any, weight: float) -> Any:
         f: F at the points, (points,) or one number.
         largest_c: largest c at the points, of the same shape.
         weight: factor on the violation [-].
+
+    Returns:
+        The sum, in the shape of `f`.
     """
     return f + PENALTY * np.log1p(weight * np.maximum(largest_c, 0.0))
