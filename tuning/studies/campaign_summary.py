@@ -296,6 +296,9 @@ def most_extreme(metric: str, values: np.ndarray, failed: np.ndarray, count: int
         values: values of the metric (trials,), in its unit; NaN if a trial has no value.
         failed: whether each trial failed (trials,) [-].
         count: number of indices.
+
+    Returns:
+        Indices of at most `count` trials, the worst first.
     """
     # SAMPLES[0] counts samples without an error
     larger_is_better = metric in (*catalogues.LARGER_IS_BETTER, run_tables.SAMPLES[0])
