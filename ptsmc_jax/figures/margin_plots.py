@@ -101,7 +101,7 @@ def margins_over_time(
 ) -> Figure:
     """Plot the margins of the worst axis against time to go, and of the hold phase as lines.
 
-    Times before the first judged sample and after the last one are grey.
+    Times of samples that no requirement judges are grey, before the first judged sample and after the last one.
 
     Args:
         time_to_go: times to go (times,) [s], longest first.
@@ -141,8 +141,9 @@ def margins_over_time(
     if judged.any():
         near, far = rows[0].get_xlim()
         for axes in rows:
-            axes.axvspan(far, time_to_go[judged][0], color="0.93", zorder=0, label="not judged")
-            axes.axvspan(time_to_go[judged][-1], near, color="0.93", zorder=0)
+            axes.axvspan(far, time_to_go[judged][0], color="0.93", zorder=0, label="not judged\nby requirements")
+            if not judged[-1]:  # otherwise the rest of the axis has no sample
+                axes.axvspan(time_to_go[judged][-1], near, color="0.93", zorder=0)
             axes.set_xlim(far, near)
     for axes in rows:
         axes.legend(fontsize=9, loc="center left", bbox_to_anchor=(1.0, 0.5))

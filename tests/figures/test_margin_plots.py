@@ -45,7 +45,10 @@ def test_times_that_are_not_judged_are_grey():
         np.testing.assert_allclose(np.sort(grey), [[10.0, far], [near, 2.0]])
         assert far > 40.0
         assert near < 1.0
-        assert axes.get_legend_handles_labels()[1].count("not judged") == 1
+        assert axes.get_legend_handles_labels()[1].count("not judged\nby requirements") == 1
+    # earlier, the strip after the last sample was grey even if requirements judge this sample
+    cut = margin_plots.margins_over_time(time_to_go[:5], judged[:5], margins(5), margins(1))
+    assert [len(axes.patches) for axes in cut.axes] == [1, 1, 1]
 
 
 def test_required_margins_are_drawn():

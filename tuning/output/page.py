@@ -60,7 +60,8 @@ CAPTIONS = {
     "map": "Error and peak torque over the two keys, with the stability limits of the loop.",
     "nichols": "The open loop at each axis of the plant's input, the others closed.",
     "sensitivity": "Transfer of disturbances (S) and noise (T) over the frequency.",
-    "margins": "Margins of the nominal loop in the approach phase, with its gains frozen.",
+    "margins": "Margins of the nominal loop in the approach phase, with its gains frozen; grey: times that no "
+    "requirement judges, because the gains change within the settling time of the loop.",
     "fan": "The error over time: the fraction of trials inside each band.",
     "distributions": "The fraction of the trials up to each value; the scale stretches both ends.",
     "inputs": "Metrics (up) over the sampled inputs (across), a point for each trial; limits are dashed.",
