@@ -153,7 +153,7 @@ def torque_by_angle(
     start: Column,
     torque: Column,
     outcome: np.ndarray,
-    totals: Mapping[str, int],
+    labels: Mapping[str, str],
     metric: str = "peak_torque",
 ) -> Figure:
     """Plot a peak torque against the initial error, a point a trial.
@@ -162,12 +162,12 @@ def torque_by_angle(
         start: initial error of each trial.
         torque: peak torque of each trial.
         outcome: one of `MARKS` for each, (trials,).
-        totals: how many trials of the whole campaign have each outcome.
+        labels: label of each outcome in the legend.
         metric: name of the metric of `torque`.
     """
     (start,), name = in_readable_units({"": start}).values(), metric.replace("_", " ")
     figure, axes = new_figure(f"{name.capitalize()} by initial error", torque.label(name))
-    _scatter_by_outcome(axes, start.values, torque.values, outcome, totals)
+    _scatter_by_outcome(axes, start.values, torque.values, outcome, labels)
     axes.set_xlabel(start.label("initial angle" if start.unit in ("deg", "arcsec") else "initial error"))
     limit = torque.limit
     if limit is not None:
@@ -186,7 +186,7 @@ def inputs(
     drawn: Mapping[str, Column],
     metrics: Mapping[str, Column],
     outcome: np.ndarray,
-    totals: Mapping[str, int],
+    labels: Mapping[str, str],
 ) -> Figure:
     """Plot metrics against dispersed quantities, with a point for each trial.
 
@@ -203,7 +203,7 @@ def inputs(
     grid = figure.subplots(rows, columns, sharex="col", sharey="row", squeeze=False)
     for line, (metric, column) in zip(grid, metrics.items(), strict=True):
         for axes, x in zip(line, drawn.values(), strict=True):
-            _scatter_by_outcome(axes, x.values, column.values, outcome, totals)
+            _scatter_by_outcome(axes, x.values, column.values, outcome, labels)
             if column.limit is not None:
                 axes.axhline(column.limit, **LIMIT, label="limit")
             if column.shown.size and column.shown.max() > 10.0 * column.shown.min() > 0.0:
@@ -218,12 +218,11 @@ def inputs(
 
 
 def _scatter_by_outcome(
-    axes: Axes, x: np.ndarray, y: np.ndarray, outcome: np.ndarray, totals: Mapping[str, int]
+    axes: Axes, x: np.ndarray, y: np.ndarray, outcome: np.ndarray, labels: Mapping[str, str]
 ) -> None:
     for name, (colour, marker, size) in MARKS.items():
         has_outcome = outcome == name
         if np.any(has_outcome):
-            label = f"{name.replace('_', ' ')}: {totals[name]}"
             width = 1.2 if marker in ("x", "+") else 0.0  # line markers are invisible without a width
             style: Any = {"s": size, "c": colour, "marker": marker, "alpha": 0.6, "linewidths": width}
-            axes.scatter(x[has_outcome], y[has_outcome], label=label, **style)
+            axes.scatter(x[has_outcome], y[has_outcome], label=labels[name], **style)

@@ -30,10 +30,14 @@ FRAME = pl.DataFrame({
 ])  # fmt: skip
 def test_outcomes_distinguish_requirements_that_allow_violations_for_some_time(interpretation, outcomes, said):
     asked = Requirement("ape_z", 1.0, "rad", quantile=0.8, interpretation=interpretation)
-    assert campaign_figures._classify_trials(FRAME, [asked]).tolist() == outcomes
+    assert campaign_figures._classify_trials(FRAME, [asked])[0].tolist() == outcomes
     torque = Requirement("peak_torque", 2.0, "N m")
     for both in ([asked, torque], [torque, asked]):  # a broken limit on trials has priority in either order
-        assert campaign_figures._classify_trials(FRAME, both).tolist() == [BEYOND, *outcomes[1:]]
+        outcome, missed = campaign_figures._classify_trials(FRAME, both)
+        assert outcome.tolist() == [BEYOND, *outcomes[1:]]
+        assert "peak_torque" in missed[BEYOND]
+        assert ("ape_z" in missed[BEYOND]) == (BEYOND in outcomes)
+        assert missed.get(AT_TIMES, []) == ["ape_z"] * (AT_TIMES in outcomes)
     values, within = FRAME["ape_z"].to_numpy(), FRAME["within_ape_z"].to_numpy()
     verdict = asked.verdict(values, np.array([True, True, True, False]), within)
     assert campaign_figures._describe_time_fraction(verdict) == said
@@ -132,6 +136,14 @@ def test_figures_show_the_required_torque_and_the_inputs_that_drive_a_metric(mon
     assert axes.get_ylabel() == "peak torque delivered [N m]"
     assert "limit 5e-05 N m" in axes.get_legend_handles_labels()[1]
     assert [axes.get_xlabel() for axes in figures["inputs"].axes if axes.get_xlabel()] == ["initial_angle [arcsec]"]
+
+
+def test_figures_name_the_required_metric_of_the_marked_trials(monkeypatch):
+    """The figure of the torque marks trials beyond the limit of another metric; an earlier version did not name it."""
+    folder = folder_of_figures(monkeypatch, "window_angle")
+    folder.scenario = scenario.replace(folder.scenario, requirements={"window_angle": 1e-5})
+    (axes,) = campaign_figures.build(folder, {"verdicts": [], "drivers": {}})["torque_by_angle"].axes
+    assert "beyond a limit (window_angle): 11" in axes.get_legend_handles_labels()[1]
 
 
 @pytest.mark.parametrize(("required", "shown"), [

@@ -48,8 +48,11 @@ def build(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
         figures["distributions"] = plots.distributions(
             {name: plotted_column(name, np.where(finished, frame[name].to_numpy(), np.nan)) for name in names}
         )
-    outcome = _classify_trials(frame, required)
-    totals = {name: int((outcome == name).sum()) for name in plots.MARKS}
+    outcome, missed = _classify_trials(frame, required)
+    labels = {}
+    for name in plots.MARKS:
+        metrics_beyond = f" ({', '.join(missed[name])})" if name in missed else ""
+        labels[name] = f"{name.replace('_', ' ')}{metrics_beyond}: {np.count_nonzero(outcome == name)}"
     is_good = np.isin(outcome, (plots.KEPT, plots.AT_TIMES))
     bad_trials, good_trials = np.flatnonzero(~is_good)[: SCATTER_TRIALS // 2], np.flatnonzero(is_good)
     # failed trials and trials beyond a limit come last, so that their marks are on top
@@ -57,7 +60,7 @@ def build(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
     angle, torque = (frame[name].to_numpy().astype(float)[plotted] for name in ("initial_angle", torque_name))
     if np.isfinite(torque).any():
         angles, torques = plotted_column("initial_angle", angle), plotted_column(torque_name, torque)
-        figures["torque_by_angle"] = plots.torque_by_angle(angles, torques, outcome[plotted], totals, torque_name)
+        figures["torque_by_angle"] = plots.torque_by_angle(angles, torques, outcome[plotted], labels, torque_name)
     strongest_inputs = _strongest_inputs(summary, names[:4])
     if strongest_inputs:
         inputs = rows.read(parts, strongest_inputs)[plotted]
@@ -65,7 +68,7 @@ def build(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
             {name: plotted_column(name, inputs[name].to_numpy()) for name in strongest_inputs},
             {name: plotted_column(name, frame[name].to_numpy()[plotted].astype(float)) for name in names[:4]},
             outcome[plotted],
-            totals,
+            labels,
         )
     return figures
 
@@ -79,8 +82,8 @@ def _strongest_inputs(summary: dict[str, Any], metrics: Sequence[str]) -> list[s
     return sorted(explained, key=lambda name: -explained[name])[:4]
 
 
-def _classify_trials(frame: pl.DataFrame, required: Sequence[Requirement]) -> np.ndarray:
-    """Return the outcome of each trial, a key of `plots.MARKS`, (trials,).
+def _classify_trials(frame: pl.DataFrame, required: Sequence[Requirement]) -> tuple[np.ndarray, dict[str, list[str]]]:
+    """Return the outcome of each trial, a key of `plots.MARKS`, (trials,), and the metrics beyond a limit by outcome.
 
     Some requirements ask for a fraction of the time within the limit. A single trial can break such a requirement if
     its interpretation is "temporal", but not if it is "mixed": then the fraction is a mean over all runs.
@@ -88,6 +91,7 @@ def _classify_trials(frame: pl.DataFrame, required: Sequence[Requirement]) -> np
     outcome = frame["status"].to_numpy().astype(object)
     ok = outcome == "ok"
     outcome[ok] = plots.KEPT
+    missed: dict[str, list[str]] = {}
     for requirement in required:
         is_beyond = ok & ~(frame[requirement.metric].to_numpy() <= requirement.limit)
         is_broken = is_beyond if requirement.timed is None else np.zeros_like(ok)
@@ -95,7 +99,10 @@ def _classify_trials(frame: pl.DataFrame, required: Sequence[Requirement]) -> np
             is_broken = ok & ~(frame[requirement.timed].to_numpy() >= requirement.quantile)
         outcome[is_beyond & (outcome == plots.KEPT)] = plots.AT_TIMES
         outcome[is_broken] = plots.BEYOND
-    return outcome
+        for name, trials in ((plots.AT_TIMES, is_beyond & ~is_broken), (plots.BEYOND, is_broken)):
+            if trials.any():
+                missed.setdefault(name, []).append(requirement.metric)
+    return outcome, missed
 
 
 def _describe_time_fraction(verdict: Verdict) -> str:
