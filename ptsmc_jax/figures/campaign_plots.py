@@ -195,7 +195,7 @@ def inputs(
             first.
         metrics: metrics by name, a row of the figure each.
         outcome: one of `MARKS` for each trial, (trials,).
-        totals: number of trials of the whole campaign with each outcome.
+        labels: label of each outcome in the legend.
     """
     drawn, metrics = in_readable_units(drawn), in_readable_units(metrics)
     rows, columns = len(metrics), len(drawn)
@@ -212,7 +212,7 @@ def inputs(
     for axes, (name, x) in zip(grid[-1], drawn.items(), strict=True):
         axes.set_xlabel(x.label(name))
         axes.xaxis.set_major_locator(MaxNLocator(4))
-    figure.suptitle(f"Strongest input: {next(iter(drawn))}")
+    figure.suptitle("Inputs that explain a metric best")
     legend_below(figure, columns)
     return figure
 

@@ -118,6 +118,11 @@ def without_norms(metrics: Iterable[str]) -> list[str]:
     return [name for name in names if ANGLE_METRICS.get(name) not in names]
 
 
+def explained_metrics(required: Iterable[str]) -> list[str]:
+    """Return the metrics whose strongest inputs a campaign shows: the window error and the required metrics."""
+    return without_norms(("window_error", *required))
+
+
 def percent(fraction: float) -> str:
     """Return a fraction in per cent, with three digits of it or of its difference to 100 %.
 

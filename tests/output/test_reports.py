@@ -590,6 +590,12 @@ def test_driver_explains_a_significant_part_of_the_variance(correlation, trials,
     assert line == (driven if named else NO_DRIVER)
 
 
+def test_driver_without_a_monotonic_influence_has_no_rank_correlation():
+    """An earlier version printed `rank correlation -0.00, 19 % of the variance of the ranks`."""
+    (line,) = driver_lines({"disturbance_phase_1": {"rank_correlation": -0.001, "first_order": 0.19}}, 1000)
+    assert "disturbance_phase_1 (mostly not monotonic, 19 % of the variance of the ranks)" in line
+
+
 def test_constants_of_the_search_have_the_same_values():
     assert (tune_report.CONFIDENT, tune_report.HOPELESS) == (100 * confirm.CONFIDENT, optimise.HOPELESS)
 

@@ -127,14 +127,16 @@ def driver_lines(summary: Campaign) -> Iterator[str]:
     An input is named if it explains a significant fraction of at least `statistics.MIN_EXPLAINED` of the variance.
     """
     unexplained = list[str]()
-    for metric in catalogues.without_norms(("window_error", *(one.metric for one in summary.verdicts))):
+    for metric in catalogues.explained_metrics(one.metric for one in summary.verdicts):
         sensitivities = summary.drivers.get(metric, {})
         explained = statistics.strongest_drivers(sensitivities, summary.driver_trials.get(metric, 0))
         strongest, texts = list(explained)[:3], []
         for name in strongest:
             rank = sensitivities[name]["rank_correlation"]
-            # the number of a wheel has no rank correlation
-            correlation = "" if rank is None else f"rank correlation {rank:+.2f}, "
+            correlation = ""  # the number of a wheel has no rank correlation
+            if rank is not None:
+                is_monotonic = 2.0 * rank**2 > explained[name]
+                correlation = f"rank correlation {rank:+.2f}, " if is_monotonic else "mostly not monotonic, "
             texts.append(f"{name} ({correlation}{100 * explained[name]:.0f} % of the variance of the ranks)")
         if texts:
             overlap = "; these inputs are correlated, so their percentages overlap"

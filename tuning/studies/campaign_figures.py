@@ -13,7 +13,7 @@ from ptsmc_jax.campaigns import rows
 from ptsmc_jax.figures import campaign_plots as plots
 from ptsmc_jax.figures.style import torque_metric
 from ptsmc_jax.numerics import statistics
-from ptsmc_jax.simulation.catalogues import as_angle, percent, without_norms
+from ptsmc_jax.simulation.catalogues import as_angle, explained_metrics, percent, without_norms
 from ptsmc_jax.simulation.requirements import INTERPRETATIONS, Requirement, Verdict
 from tuning.studies.campaign_folder import Folder
 
@@ -61,12 +61,14 @@ def build(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
     if np.isfinite(torque).any():
         angles, torques = plotted_column("initial_angle", angle), plotted_column(torque_name, torque)
         figures["torque_by_angle"] = plots.torque_by_angle(angles, torques, outcome[plotted], labels, torque_name)
-    strongest_inputs = _strongest_inputs(summary, names[:4])
+    explained = explained_metrics(verdict["metric"] for verdict in summary["verdicts"])
+    shown = [name for name in names if name in explained][:4]
+    strongest_inputs = _strongest_inputs(summary, shown)
     if strongest_inputs:
         inputs = rows.read(parts, strongest_inputs)[plotted]
         figures["inputs"] = plots.inputs(
             {name: plotted_column(name, inputs[name].to_numpy()) for name in strongest_inputs},
-            {name: plotted_column(name, frame[name].to_numpy()[plotted].astype(float)) for name in names[:4]},
+            {name: plotted_column(name, frame[name].to_numpy()[plotted].astype(float)) for name in shown},
             outcome[plotted],
             labels,
         )
