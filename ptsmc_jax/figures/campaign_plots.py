@@ -82,7 +82,12 @@ def in_readable_units(columns: Mapping[str, Column]) -> dict[str, Column]:
 
 
 def fan(
-    t: np.ndarray, errors: np.ndarray, worst: tuple[int, np.ndarray], parts: Parts, limits: Mapping[str, float]
+    t: np.ndarray,
+    errors: np.ndarray,
+    worst: tuple[int, np.ndarray],
+    parts: Parts,
+    limits: Mapping[str, float],
+    trials: str,
 ) -> Figure:
     """Plot the error of many trials over time: bands that contain `BANDS` percent of the trials, median, worst trial.
 
@@ -92,11 +97,11 @@ def fan(
         worst: the trial of the largest window error, and its errors (time,).
         parts: parts of the nominal run.
         limits: required limits by metric, in the unit of the metric.
+        trials: the trials of `errors` in words, for the title.
     """
     t_f = float(parts.controller.t_f)
     convert, name, unit = error_display(plant_kind(parts))
     errors, largest = convert(errors), convert(worst[1])
-    trials = f"{len(errors)} trial{'s' if len(errors) != 1 else ''}"
     figure, axes = new_figure(f"{name.capitalize()} of {trials}, median in white", with_unit(name, unit))
     for central, grey in BANDS:
         low, high = np.percentile(errors, [50.0 - central / 2, 50.0 + central / 2], axis=0)

@@ -148,6 +148,21 @@ def test_figures_name_the_required_metric_of_the_marked_trials(monkeypatch):
     assert "beyond a limit (window_angle): 11" in axes.get_legend_handles_labels()[1]
 
 
+@pytest.mark.parametrize(("first", "broken", "trials"), [
+    (20, 0, "20 trials"), (5, 0, "the first 5 of 20 trials"), (5, 2, "the first 5 of 20 trials, 2 failed"),
+])  # fmt: skip
+def test_the_error_over_time_counts_the_trials_that_it_shows(monkeypatch, first, broken, trials):
+    """An earlier version showed 1000 of 2000 trials as all trials of the campaign."""
+    finished, ready = np.arange(20) >= broken, scenario.study(scenario.from_tables({}))
+    frame = pl.DataFrame({"trial": np.arange(20), "window_error": np.linspace(1e-6, 1e-5, 20)})
+    monkeypatch.setattr(campaign_figures, "FAN_TRIALS", first)
+    history = np.arange(1.0, 4.0), np.full((first + 1, 3), 1e-6)
+    monkeypatch.setattr(campaign_figures.running, "error_history", lambda campaign, simulated: history)
+    folder: Any = SimpleNamespace(campaign_without_metrics=SimpleNamespace(ready=ready))
+    (axes,) = campaign_figures._plot_fan(folder, frame, finished, {})["fan"].axes
+    assert axes.get_title(loc="left") == f"Pointing error of {trials}, median in white"
+
+
 @pytest.mark.parametrize(("required", "shown"), [
     ("window_angle", ["window_angle [arcsec]", "peak_torque [N m]"]),
     ("effort", ["effort [N m s]", "window_error [arcsec]", "peak_torque [N m]"]),

@@ -129,5 +129,12 @@ def _plot_fan(
     simulated = np.append(first_trials, trials[worst_row]).astype(np.uint32)
     t, error = running.error_history(folder.campaign_without_metrics, simulated)
     worst, finished_errors = (int(trials[worst_row]), error[-1]), error[:-1][finished[: first_trials.size]]
+    if not finished_errors.any():
+        return {}
+    described = f"{trials.size} trial{'s' if trials.size != 1 else ''}"
+    if first_trials.size < trials.size:
+        described = f"the first {first_trials.size} of {described}"
+    failed = first_trials.size - len(finished_errors)
+    described += f", {failed} failed" if failed else ""
     parts = folder.campaign_without_metrics.ready.parts
-    return {"fan": plots.fan(t, finished_errors, worst, parts, limits)} if finished_errors.any() else {}
+    return {"fan": plots.fan(t, finished_errors, worst, parts, limits, described)}
