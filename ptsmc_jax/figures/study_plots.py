@@ -35,6 +35,8 @@ MARKERS = ("o", "^", "s", "D", "v")
 BEYOND = ("x", "+", "1", "2", "3", "4")  # markers of points that violate a limit, one for each limit
 # marker of a pair with a failed trial, visible on any colour
 FAILED: Any = {"marker": "X", "color": "white", "mec": "black", "mew": 0.6, "ms": 6}
+# marker of a pair that does not meet a requirement
+NOT_MET: Any = {"marker": "o", "color": "white", "mec": "black", "mew": 0.6, "ms": 3.5}
 TORQUE_LIMIT = STYLES[1][0]  # colour of the required torque; grey as of `LIMIT` is a colour of the map
 NO_NUMBER = "0.9"  # grey of pairs without a number, which is not a colour of the map
 WIDEST = 1e4  # largest ratio of the values that the colours of a map span
@@ -358,8 +360,12 @@ def accuracy_map(
     limit_lines: Mapping[str, tuple[np.ndarray, np.ndarray]],
     kind: str = "spacecraft",
     torque_limit: float | None = None,
+    not_met: np.ndarray | None = None,
+    stability: str = "",
 ) -> Figure:
     """Plot simulated window error, window error by linear theory, and peak torques over two keys.
+
+    The errors have one scale of colours, so that simulation and linear theory can be compared.
 
     Args:
         x: the horizontal key.
@@ -369,6 +375,8 @@ def accuracy_map(
         limit_lines: lines (x, y) by label.
         kind: kind of the plant, which determines the units.
         torque_limit: required limit of the largest peak torque; None: no line.
+        not_met: (y, x) bool, a requirement is not met, although no trial failed; None: no requirement.
+        stability: text of the legend about the stability of the pairs.
     """
     (convert, error, error_unit), unit = error_display(kind), CATALOGUES[kind]["peak_torque"].unit
     grids = {name: convert(grid) if "error" in name else grid for name, grid in grids.items()}
@@ -386,9 +394,11 @@ def accuracy_map(
     largest = grids["largest_peak_torque"]
     is_crossed = torque_limit is not None and bool(np.any(largest < torque_limit) and np.any(largest > torque_limit))
     for axes, name in zip(panels, drawn, strict=False):
-        kind_of_number = "error" if "error" in name else "torque"  # those of a kind have one scale
-        _draw_colour_map(axes, x, y, grids[name], [grids[other] for other in drawn if kind_of_number in other])
+        same_scale = [other for other in drawn if "error" in other] if "error" in name else [name]
+        _draw_colour_map(axes, x, y, grids[name], [grids[other] for other in same_scale])
         axes.plot(column[failed], row[failed], ls="", **FAILED)
+        if not_met is not None:
+            axes.plot(column[not_met], row[not_met], ls="", **NOT_MET)
         limits = axes.get_xlim(), axes.get_ylim()
         lines = {label: line for label, line in limit_lines.items() if _is_inside(axes, line)}
         for (label, line), (_, style) in zip(lines.items(), STYLES, strict=False):
@@ -409,6 +419,9 @@ def accuracy_map(
     if np.any(failed):
         handles.append(matplotlib.lines.Line2D([], [], ls="", **FAILED))
         labels.append("a trial failed or did not converge at t_f")
+    if not_met is not None and np.any(not_met):
+        handles.append(matplotlib.lines.Line2D([], [], ls="", **NOT_MET))
+        labels.append("a requirement is not met, see not_met in map.csv")
     if not all(np.all(np.isfinite(grids[name])) for name in drawn):
         handles.append(matplotlib.patches.Patch(color=NO_NUMBER))
         labels.append("the panel has no value, see map.csv")
@@ -416,6 +429,9 @@ def accuracy_map(
         handles.append(matplotlib.lines.Line2D([], [], color=TORQUE_LIMIT if is_crossed else "none", lw=2.0))
         beyond = "" if is_crossed else ", beyond this map"
         labels.append(f"limit of peak_torque {torque_limit:g} {unit}{beyond}")
+    if stability:
+        handles.append(matplotlib.lines.Line2D([], [], ls=""))
+        labels.append(stability)
     if handles:
         figure.legend(handles, labels, loc="outside upper left", ncols=2)
     return figure

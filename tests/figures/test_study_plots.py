@@ -175,6 +175,23 @@ def test_the_legend_of_a_map_names_what_the_map_shows():
     ]
 
 
+def test_panels_of_a_map_share_a_scale_for_the_same_quantity_only():
+    """An earlier version had one scale for the mean and the largest torque, so that both panels were flat."""
+    axis = study_plots.MapAxis("delta [s]", [1.0, 2.0], False)
+    grids = {name: GRID * factor for name, factor in zip(NAMES, (1.0, 2.0, 1.0, 100.0), strict=True)}
+    not_met = np.array([[True, False], [False, False]])
+    figure = study_plots.accuracy_map(axis, axis, grids, ~not_met, {}, not_met=not_met, stability="all pairs stable")
+    scales = [axes.collections[0].get_clim() for axes in figure.axes[:4]]
+    assert scales[0] == scales[1]
+    for limits, name in zip(scales[2:], NAMES[2:], strict=True):
+        np.testing.assert_allclose(limits, (grids[name].min(), grids[name].max()))
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == [
+        "a trial failed or did not converge at t_f",
+        "a requirement is not met, see not_met in map.csv",
+        "all pairs stable",
+    ]
+
+
 @pytest.mark.parametrize(("limit", "drawn"), [(2.5e-5, True), (1.0, False)])
 def test_the_required_torque_is_drawn_on_the_largest_peak_torque(limit, drawn):
     axis = study_plots.MapAxis("delta [s]", [1.0, 2.0], True)

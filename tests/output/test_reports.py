@@ -329,13 +329,20 @@ def campaign_gains(**tables: dict[str, Any]) -> Table:
 
 def pairs(count: int, meets: float = math.nan) -> Iterable[str]:
     pair = {"status": "simulated", "failures": 0.0, "not_converged": 0.0, "window_error": 2e-6, "peak_torque": 0.3,
-            "meets": meets}  # fmt: skip
+            "meets": meets, "not_met": ""}  # fmt: skip
     every = [
         {**pair, "x": 1.0, "y": 1.0, "failures": 3.0, "window_error": 1e-6},
         {**pair, "x": 1.0, "y": 2.0},
         {**pair, "x": 2.0, "y": 1.0, "not_converged": 2.0, "window_error": 1e-6},
         {**pair, "x": 2.0, "y": 2.0, "status": "loop.period is 2", "window_error": math.nan},
-        {**pair, "x": 3.0, "y": 1.0, "window_error": 1e-7, "meets": 0.0 * meets},
+        {
+            **pair,
+            "x": 3.0,
+            "y": 1.0,
+            "window_error": 1e-7,
+            "meets": 0.0 * meets,
+            "not_met": "" if math.isnan(meets) else "peak_torque gain_margin",
+        },
     ]
     return reports.map_lines(every[:count], ("loop.period [s]", "controller.eta"), "spacecraft")
 
@@ -344,9 +351,9 @@ def map_of(plant: str) -> Report:
     """Return the report of a map with one pair that was simulated."""
     head = ["loop.period [s]", "controller.delta [s]", "status", "failures", "not_converged", "window_error",
             "peak_torque", "linear_window_error", "linear_torque", "hold_delay_margin",
-            "gain_margin", "meets"]  # fmt: skip
-    pairs = [["0.1", "1.0", "simulated", "0", "0", "1e-05", "0.25", "5e-06", "0.01", "0.2", "2.0", "0"],
-             ["0.1", "0.05", "controller.delta is 0.05", *([""] * 9)]]  # fmt: skip
+            "gain_margin", "meets", "not_met"]  # fmt: skip
+    pairs = [["0.1", "1.0", "simulated", "0", "0", "1e-05", "0.25", "5e-06", "0.01", "0.2", "2.0", "0", "gain_margin"],
+             ["0.1", "0.05", "controller.delta is 0.05", *([""] * 10)]]  # fmt: skip
     return reports.map_report([head, *pairs], plant)
 
 

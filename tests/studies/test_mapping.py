@@ -198,6 +198,7 @@ def test_a_map_says_which_pairs_keep_every_requirement(monkeypatch):
     monkeypatch.setattr(montecarlo, "run", run)
     _, _, _, cells = simulated("controller.eta=3:4:2", "controller.delta=0.4:0.5:2", text, trials=4)
     assert [cell.meets for cell in cells] == [1, 0, 1, 0]
+    assert [cell.not_met for cell in cells] == ["", "peak_torque", "", "peak_torque"]
     assert asked == [(["gain_margin"], True)] * 4
 
 
@@ -376,6 +377,10 @@ def test_stability_limit_contour_separates_stable_and_unstable_pairs(monkeypatch
     # all pairs are unstable at the hand-over, so that the only limit is in the hold phase
     ((label, (across, up)),) = mapping.stability_limit_contours(mapping.Map(loaded, x, y, cells)).items()
     assert label == "stability limit in the hold phase, linear theory"
+    assert mapping.describe_equal_stability(mapping.Map(loaded, x, y, cells)).startswith("no simulated pair is stable")
+    stable = [replace(cell, radius=1.0, hold_radius=0.9) for cell in cells]
+    assert mapping.describe_equal_stability(mapping.Map(loaded, x, y, stable)).startswith("all simulated pairs are st")
+    assert not mapping.describe_equal_stability(mapping.Map(loaded, x, y, [*stable[1:], cells[0]]))
     drawn = np.isfinite(across)
     np.testing.assert_allclose(across[drawn], 6.0 - 1.6 * (up[drawn] - 1.5), atol=1e-4)
     assert (up[drawn].min(), up[drawn].max()) == (1.0, 2.0)

@@ -57,7 +57,8 @@ CAPTIONS = {
     "slew_times": "The error and the costs of the slew over the prescribed time; open points break a requirement.",
     "robustness": "The error, the torque and the margins over the limit on the peak sensitivity; open points break "
     "a requirement.",
-    "map": "Error and peak torque over the two keys, with the stability limits of the loop.",
+    "map": "Error and peak torque over the two keys, with the stability limits of the loop; points break "
+    "a requirement.",
     "nichols": "The open loop at each axis of the plant's input, the others closed.",
     "sensitivity": "Transfer of disturbances (S) and noise (T) over the frequency.",
     "margins": "Margins of the nominal loop in the approach phase, with its gains frozen; grey: times that no "

@@ -3,6 +3,7 @@
 import contextlib
 import csv
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,8 @@ MAP_NOTE = (
     "linear_window_error and linear_torque are predictions of linear theory for the noise alone, with explicit "
     "sampling. radius, gain_margin and delay_margin belong to the loop at the hand-over with frozen gains, hold_radius "
     "and the others with hold_ to the hold phase. The loop is stable up to a radius of 1. gain_margin and "
-    "delay_margin are those of the worst axis; they are not positive if the loop is unstable."
+    "delay_margin are those of the worst axis; they are not positive if the loop is unstable. meets is 0 if a "
+    "requirement is not met, which not_met names, or if a trial fails or does not converge at t_f."
 )
 
 
@@ -185,7 +187,7 @@ def map_report(rows: Sequence[Sequence[str]], plant: str) -> Report:
 
 
 def map_lines(pairs: Sequence[Mapping[str, Any]], keys: tuple[str, str], plant: str) -> Iterator[str]:
-    """Return the best pair, of those that keep every requirement, and the number of pairs that were simulated.
+    """Return the best pair, of those that keep every requirement, and how many pairs fail, and why.
 
     Args:
         pairs: the rows of a map by column; x and y are the values of the keys.
@@ -213,6 +215,11 @@ def map_lines(pairs: Sequence[Mapping[str, Any]], keys: tuple[str, str], plant: 
         f"{len(simulated)} of {len(pairs)} pairs simulated, {failed} of them with trials that failed or "
         "did not converge at t_f"
     )
+    texts = (pair["not_met"] for pair in simulated if isinstance(pair["not_met"], str))  # NaN: an empty cell
+    not_met = Counter(" ".join(texts).split()).most_common()
+    if not_met:
+        yield f"not met: {', '.join(f'{name} at {count} of {len(simulated)} pairs' for name, count in not_met)}"
+    yield "default gains are designed once for the scenario, and not again for each pair"
     refused = [pair["status"] for pair in pairs if pair["status"] != "simulated"]
     if refused:
         yield f"{len(refused)} of {len(pairs)} pairs are not allowed, the first one because {refused[0]}"

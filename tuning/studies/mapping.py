@@ -67,6 +67,7 @@ class Cell:
     hold_delay_margin: float = np.nan  # delay margin in the hold phase [s]
     hold_radius: float = np.nan  # spectral radius of the frozen loop in the hold phase [-]
     meets: float = np.nan  # whether the pair keeps every requirement, 1 or 0; NaN without requirements
+    not_met: str = ""  # names of the requirements that the pair does not keep, separated by spaces
 
 
 @dataclass(frozen=True)
@@ -239,7 +240,7 @@ def _simulate_pair(x: float, y: float, ready: Study, parts: Parts, seed: int, tr
     simulated = montecarlo.run(parts, ready.dispersion, seed, np.arange(count))
     finished, counts = simulated.finished, simulated.counts()
     errors, peaks = simulated.metrics.window_error[finished], simulated.metrics.peak_torque[finished]
-    results: dict[str, float] = {}
+    results: dict[str, Any] = {}
     if finished.any():
         results = {
             "window_error": float(trust.rms(errors)),
@@ -254,6 +255,7 @@ def _simulate_pair(x: float, y: float, ready: Study, parts: Parts, seed: int, tr
         verdicts = requirements.verdicts(on_trials, lambda name: getattr(simulated.metrics, name), finished)
         verdicts += margin_verdicts.judge_loop(parts, ready.margins, finished=bool(finished.all()))
         results["meets"] = int(judging.meets_requirements(verdicts, simulated))
+        results["not_met"] = " ".join(verdict.metric for verdict in verdicts if not verdict.met)
     if ready.scenario.sampled:
         ends = run_margins.margins_at_ends(parts)
         for prefix, (axis_margins, radius) in (("", ends["hand_over"]), ("hold_", ends["hold"])):
@@ -322,8 +324,7 @@ def stability_limit_contours(simulated: Map) -> dict[str, tuple[np.ndarray, np.n
     axes = simulated.x, simulated.y
     x_values, y_values = (np.log(axis.values) if axis.logarithmic else np.asarray(axis.values) for axis in axes)
     curves = {}
-    phases = {"radius": "at the hand-over"} if simulated.scenario.controller.law.prescribed else {}
-    for name, phase in (phases | {"hold_radius": "in the hold phase"}).items():
+    for name, phase in _radii(simulated.scenario).items():
         grid = simulated.grid(name)
         log_radius = np.ma.masked_invalid(np.log(np.where(grid > 0.0, grid, np.nan)))
         pieces: Any = contour_generator(x_values, y_values, log_radius).lines(margins.CIRCLE_TOLERANCE)
@@ -333,6 +334,21 @@ def stability_limit_contours(simulated: Map) -> dict[str, tuple[np.ndarray, np.n
                 np.exp(v) if axis.logarithmic else v for axis, v in zip(axes, points.T, strict=True)
             )
     return curves
+
+
+def describe_equal_stability(simulated: Map) -> str:
+    """Return a text if all pairs of a map are stable, or all unstable; empty if both exist."""
+    radius = np.max([simulated.grid(name) for name in _radii(simulated.scenario)], axis=0)
+    stable = radius[np.isfinite(radius)] < 1.0 + margins.CIRCLE_TOLERANCE
+    if not stable.size or (stable.any() and not stable.all()):
+        return ""
+    return f"{'all simulated pairs are' if stable.all() else 'no simulated pair is'} stable by linear theory"
+
+
+def _radii(scenario: Scenario) -> dict[str, str]:
+    """Return the fields of the spectral radius that decide the stability of a pair, and their phases in words."""
+    phases = {"radius": "at the hand-over"} if scenario.controller.law.prescribed else {}
+    return phases | {"hold_radius": "in the hold phase"}
 
 
 def label_with_unit(scenario: Scenario, key: str) -> str:
@@ -372,13 +388,16 @@ def write(folder: Path, simulated: Map, seed: int, figures: bool) -> None:
             for label, axis in zip(keys_with_units, (x, y), strict=True)
         )
         limit = tables.limit_of(scenario, "peak_torque")
+        failed = simulated.grid("failures") + simulated.grid("not_converged") > 0
         figure = study_plots.accuracy_map(
             x_axis,
             y_axis,
             grids,
-            simulated.grid("failures") + simulated.grid("not_converged") > 0,
+            failed,
             stability_limit_formulas(scenario, x, y) or stability_limit_contours(simulated),
             scenario.plant.kind,
             limit,
+            (simulated.grid("meets") == 0) & ~failed,
+            describe_equal_stability(simulated),
         )
         style.save({"map": figure}, folder / "figures")
