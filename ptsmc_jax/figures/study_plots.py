@@ -89,6 +89,7 @@ def tuning_history(
     gains: Mapping[str, tuple[str, np.ndarray]],
     values: np.ndarray,
     admissible: np.ndarray,
+    stages: np.ndarray,
     goal: str,
     result: tuple[float, Mapping[str, float]],
 ) -> Figure:
@@ -98,6 +99,7 @@ def tuning_history(
         gains: unit and values (steps, starts) by name.
         values: (steps, starts) of the objective; NaN after a starting point was given up.
         admissible: (steps, starts) bool, every requirement is met.
+        stages: (steps, starts) number of the stage; NaN after a starting point was given up.
         goal: name and unit of the objective.
         result: objective on the training trials, and gains.
     """
@@ -108,6 +110,8 @@ def tuning_history(
         axes[0].semilogy(steps, values[:, start], color="0.75", lw=1.0)
         met = np.where(admissible[:, start], values[:, start], np.nan)
         axes[0].semilogy(steps, met, color=STYLES[0][0])
+    begins = np.isfinite(stages) & (np.diff(stages, axis=0, prepend=np.nan) != 0)
+    axes[0].semilogy(np.nonzero(begins)[0], values[begins], "k.", ms=4, label="a stage begins")
     plain_ticks(axes[0].yaxis)
     axes[0].plot([], [], color=STYLES[0][0], label="requirements met")
     axes[0].plot([], [], color="0.75", label="beyond a limit")
@@ -116,13 +120,13 @@ def tuning_history(
         ax.axhline(value, color="black", lw=1.0, ls=":", zorder=3, label="result")
     axes[0].set_ylabel(goal)
     figure.suptitle("Local searches on the training trials")
-    axes[0].legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, fontsize=9)
+    axes[0].legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, fontsize=9)
     for ax, (name, (unit, courses)) in zip(axes[1:], gains.items(), strict=True):
         ax.plot(steps, courses, color=STYLES[1][0], lw=1.0)
         ax.set_ylabel(f"{name}\n[{unit}]")
         if is_log_scaled(np.nanmin(courses), np.nanmax(courses)):
             logarithmic(ax, "y")
-    axes[-1].set_xlabel("step")
+    axes[-1].set_xlabel("step of the local search, all stages")
     axes[-1].xaxis.set_major_locator(matplotlib.ticker.MaxNLocator(integer=True))
     return figure
 

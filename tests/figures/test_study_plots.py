@@ -29,7 +29,11 @@ def test_the_search_is_coloured_where_the_requirements_are_met():
     values = np.array([[3.0, 5.0], [2.0, 4.0], [1.0, np.nan]])
     met = np.array([[False, True], [True, False], [True, False]])
     result = 0.9, {"eta": 3.1}
-    figure = study_plots.tuning_history({"eta": ("-", np.full((3, 2), 3.0))}, values, met, "window error", result)
+    stages = np.array([[1.0, 2.0], [1.0, 2.0], [3.0, np.nan]])
+    gains = {"eta": ("-", np.full((3, 2), 3.0))}
+    figure = study_plots.tuning_history(gains, values, met, stages, "window error", result)
+    (begins,) = [line for line in figure.axes[0].lines if line.get_label() == "a stage begins"]
+    assert np.asarray(begins.get_xydata()).tolist() == [[0.0, 3.0], [0.0, 5.0], [2.0, 1.0]]
     for axes, value in zip(figure.axes, (0.9, 3.1), strict=True):  # not the last step of a local search
         (line,) = [line for line in axes.lines if str(line.get_label()).startswith("result")]
         assert set(np.asarray(line.get_ydata()).tolist()) == {value}

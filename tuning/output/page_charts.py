@@ -236,7 +236,8 @@ def search(
             "line": {"width": 1, "color": COLOURS[k % len(COLOURS)]},
         })  # fmt: skip
     y_axis = {"title": {"text": title}, **_LOGARITHMIC}  # its values may be within a factor of 2
-    return {"data": data, "layout": _layout(xaxis={"title": {"text": "step of the local search"}}, yaxis=y_axis)}
+    x_axis = {"title": {"text": "step of the local search, all stages"}}
+    return {"data": data, "layout": _layout(xaxis=x_axis, yaxis=y_axis)}
 
 
 def to_json_numbers(values: np.ndarray) -> list[float | None]:

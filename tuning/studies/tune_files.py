@@ -266,6 +266,7 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, "Figure"]:
             {name: (units[k], gains[:, :, k]) for k, name in enumerate(names)},
             to_unit(over_steps(lambda step: step.value)),
             over_steps(lambda step: np.all(step.worst <= 1.0), missing=False),
+            over_steps(lambda step: float(step.stage)),
             objective,
             (float(to_unit(tuning.search.value)), dict(zip(names, map(float, tuning.search.gains), strict=True))),
         ),
