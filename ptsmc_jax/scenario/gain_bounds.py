@@ -15,6 +15,7 @@ from ptsmc_jax.scenario.values import MOST_STEPS
 
 Interval = tuple[float, float]
 SLOWEST_DECAY = 3.5  # smallest K1 / `BoundsContext.slowest_rate`
+LARGEST_CORRECTION = 0.99  # largest correction of the filter / error that the star tracker measures
 
 
 def is_log_scaled(low: Any, high: Any) -> Any:
@@ -220,10 +221,12 @@ def _usual_corner(context: BoundsContext) -> Interval:
 
 
 def _usual_bandwidth(context: BoundsContext) -> Interval:
+    """Return a tenth to ten times the bandwidth, at most that whose correction is nearly all of the measured error."""
     scenario = context.scenario
     estimator: Any = scenario.estimator
     width = estimator.bandwidth
-    return 0.1 * width, min(10.0 * width, max(2.0 * width, 1.0 / scenario.devices.interval(scenario.loop.period)))
+    largest = -0.5 * math.log1p(-LARGEST_CORRECTION) / scenario.devices.interval(scenario.loop.period)
+    return 0.1 * width, min(10.0 * width, max(2.0 * width, largest))
 
 
 BOUNDS = {

@@ -1,5 +1,6 @@
 """Tests of gains by name: set in parts and in scenarios, for single axes, and their default bounds."""
 
+import math
 from dataclasses import dataclass, fields, replace
 from typing import ClassVar
 
@@ -229,9 +230,9 @@ DEFAULT_BOUNDS = {
         ({**timed(30.0), "observer": {"kind": "prescribed_time", "t_o": 1.0}}, (15.0, 60.0)),
         ({**timed(30.0), "observer": {"kind": "prescribed_time", "t_o": 20.0}}, (21.0, 60.0)),
     ],
-    "filter_bandwidth": [  # to ten times the bandwidth, at most 1 / interval, but at least twice the bandwidth
+    "filter_bandwidth": [  # to ten times the bandwidth, at most a correction of 99 %, but at least twice the bandwidth
         (filtered(0.1), (0.05, 5.0)),
-        (filtered(0.4), (0.05, 2.5)),
+        (filtered(1.0), (0.05, math.log(10.0))),  # 1 - exp(-2 bandwidth interval) = 0.99
         (filtered(8.0), (0.05, 1.0)),
     ],
     "command_corner": [
