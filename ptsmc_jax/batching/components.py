@@ -126,7 +126,7 @@ def zero_tangent(eqn: Any) -> np.ndarray | None:
 
 
 def has_rule(name: str) -> bool:
-    """Return whether a primitive is evaluated on components, or always on arrays by `jax.vmap`."""
+    """Return whether the evaluation of a primitive is defined: by a rule for components, or always by `jax.vmap`."""
     return name in _RULES or name in _ON_ARRAYS
 
 

@@ -150,7 +150,9 @@ def scan_dependence(body: core.Jaxpr, consts: Sequence[int], init: Sequence[int]
 def while_dependence(
     test: Any, body: Any, test_consts: Sequence[int], body_consts: Sequence[int], init: Sequence[int]
 ) -> tuple[list[int], int]:
-    """Return the flags of the carries of a `while` loop and the flags of its test.
+    """Return the inputs or batch axes that the carries and the test of a `while` loop depend on, as flags.
+
+    Flags are explained in the docstring of the module.
 
     Args:
         test: closed jaxpr of the test, see `unpack_while`.
@@ -158,6 +160,9 @@ def while_dependence(
         test_consts: flags of the constants of the test.
         body_consts: flags of the constants of the body.
         init: flags of the initial carries.
+
+    Returns:
+        The flags of each carry, and the flags of the test.
     """
     carries = scan_dependence(body.jaxpr, body_consts, init, [])
     (running,) = dependence(test.jaxpr, [*test_consts, *carries])

@@ -74,7 +74,8 @@ def scan(
     ]
     end_slots = [ends.add([], v.aval.size, v.aval.shape, v.aval.dtype) for v in carries]
 
-    def run(*refs: Any) -> None:
+    def run_block(*refs: Any) -> None:
+        """Run the scan for one block of trials and one direction: load the operands, iterate, store the carries."""
         remaining = iter(refs)
         number_refs, row_refs, end_refs = ({kind: next(remaining) for kind in t.parts} for t in (numbers, rows, ends))
         vectors = {kind: _load_rows(ref, rows.sizes[kind]) for kind, ref in row_refs.items()}
@@ -98,7 +99,7 @@ def scan(
 
     flat, width = numbers.number_arrays(), blocks * BLOCK
     end_tables = pl.pallas_call(
-        run,
+        run_block,
         out_shape=[
             jax.ShapeDtypeStruct((count * _next_power_of_two(size), width), kind) for kind, size in ends.sizes.items()
         ],

@@ -59,6 +59,7 @@ def vmap(function: Callable, in_axes: Any = 0, *, kernel: bool = False) -> Calla
     """
 
     def batched_function(*args: Any) -> Any:
+        """Return the outputs of `function` for all trials."""
         trials, one_trial, values = _batched_arguments(args, in_axes)
         closed, out = jax.make_jaxpr(function, return_shape=True)(*one_trial)
         results = _Interpreter(trials, use_kernel=kernel).evaluate(dependence.eliminate_dead_code(closed), values)
@@ -139,7 +140,14 @@ def _is_mapped(axis: int | None) -> bool:
 
 
 def _batch_directions(along: Array, shape: tuple[int, ...], count: int, trials: int) -> BatchedArray:
-    """Return directions (count, *shape) or (count, trials, *shape) of a value of this shape."""
+    """Return the directions of differentiation of an argument as a batched array.
+
+    Args:
+        along: directions (count, *shape), equal for all trials, or (count, trials, *shape).
+        shape: shape of the argument in one trial.
+        count: number of directions.
+        trials: number of trials.
+    """
     if along.shape == (count, *shape):
         return BatchedArray(shape, array=along[:, None], axes=DIRECTION)
     if along.shape == (count, trials, *shape):
@@ -206,7 +214,8 @@ class _Interpreter:
         """Return the results of one equation by `jax.vmap`, or by a sequential map, see `lapack`."""
         axes = union(_axes(values))
 
-        def operand(value: BatchedArray) -> Any:
+        def mapped_array(value: BatchedArray) -> Any:
+            """Return a value as one array. Its first axes are the batch axes over which `jax.vmap` maps it."""
             array = value.to_array(self.batch_shapes[value.axes]) if value.axes else value.array
             return array[:, 0] if value.axes == DIRECTION else array
 
@@ -221,7 +230,7 @@ class _Interpreter:
         for axis in (TRIAL, DIRECTION):
             if axes & axis:
                 function = transform(function, [0 if value.axes & axis else None for value in values])
-        arrays = [out[:, None] if axes == DIRECTION else out for out in function(*map(operand, values))]
+        arrays = [out[:, None] if axes == DIRECTION else out for out in function(*map(mapped_array, values))]
         return [BatchedArray(out.shape[len(self.batch_shapes[axes]) :], array=out, axes=axes) for out in arrays]
 
     def align(self, values: Sequence[BatchedArray], axes: Sequence[int]) -> list[BatchedArray]:
@@ -300,6 +309,7 @@ class _Interpreter:
             """Return a carry with the batch axes `axes` over which it differs. The kernel returns it with all axes."""
 
             def drop_from_component(part: Array) -> Array:
+                """Return a component (trials,) or (directions, trials) without its equal axes."""
                 part = part if axes & DIRECTION or part.ndim == 1 else part[0]
                 return part if axes & TRIAL else part[..., :1] if axes else part[0]
 
@@ -315,10 +325,12 @@ class _Interpreter:
         axes, test_axes = dependence.while_dependence(test, body, *map(_axes, (test_consts, body_consts, init)))
 
         def is_running(carry: list) -> Any:
+            """Return the result of the test: a scalar, or an array over the batch if it differs by trial."""
             (value,) = self.evaluate_inside(test, [*test_consts, *carry], in_loop=True)
             return value.to_array(self.batch_shapes[test_axes]) if test_axes else value.array
 
-        def step(carry: list) -> list:
+        def step_running_trials(carry: list) -> list:
+            """Return the carries after one step. A trial whose test is false keeps its carries."""
             after = self.align(self.evaluate_inside(body, [*body_consts, *carry], in_loop=True), axes)
             if not test_axes:
                 return after
@@ -326,7 +338,7 @@ class _Interpreter:
             return [self._map_leaves(jnp.where, running, new, old) for new, old in zip(after, carry, strict=True)]
 
         proceed = (lambda carry: jnp.any(is_running(carry))) if test_axes else is_running
-        return lax.while_loop(proceed, step, self.align(init, axes))
+        return lax.while_loop(proceed, step_running_trials, self.align(init, axes))
 
     def _map_leaves(self, function: Callable, condition: Array, *values: BatchedArray) -> BatchedArray:
         """Return function(condition, *leaves) for the leaves of values with equal axes.
@@ -338,10 +350,10 @@ class _Interpreter:
         """
         batch_axes = len(self.batch_shapes[values[0].axes])
 
-        def apply_to_leaf(*leaves: Array) -> Array:
+        def call_with_condition(*leaves: Array) -> Array:
             return function(condition.reshape(condition.shape + (1,) * (leaves[0].ndim - batch_axes)), *leaves)
 
-        return jax.tree.map(apply_to_leaf, *values)
+        return jax.tree.map(call_with_condition, *values)
 
     def cond(self, eqn: Any, values: list[BatchedArray]) -> list[BatchedArray]:
         """Return the results of `lax.cond` and `lax.switch`: of all branches if trials differ in the index."""
@@ -372,14 +384,14 @@ class _Interpreter:
         A derivative may be infinite there, and reverse mode would multiply it by zero. `jax.vmap` does the same.
         """
 
-        def mask(selected: Array, leaf: Array) -> Array:
+        def keep_selected_gradients(selected: Array, leaf: Array) -> Array:
             return jnp.where(selected, leaf, lax.stop_gradient(leaf))
 
         def stop_gradient_if_unselected(value: BatchedArray, variable: Any) -> BatchedArray:
             """Return an operand of the branch without gradient in the trials that do not select it."""
             if not jnp.issubdtype(variable.aval.dtype, jnp.inexact):
                 return value
-            return self._map_leaves(mask, selected, self._align_one(value, value.axes | TRIAL))
+            return self._map_leaves(keep_selected_gradients, selected, self._align_one(value, value.axes | TRIAL))
 
         return list(map(stop_gradient_if_unselected, operands, eqn.invars[1:]))
 
@@ -421,7 +433,7 @@ def _axes(values: Sequence[BatchedArray]) -> list[int]:
 
 
 def _split_all(values: Sequence[BatchedArray]) -> list[BatchedArray]:
-    """Return operands of a loop or branch, split into components outside of it."""
+    """Split operands into components before the loop or branch that uses them, so that this is done only once."""
     return [value if value.axes == DIRECTION else value.split() for value in values]
 
 

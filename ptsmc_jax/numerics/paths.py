@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 
 def _split_path(path: str) -> list[str | int]:
+    """Return the fields and indices of a path, such as ["observer", "gain", 1] of `observer.gain[1]`."""
     return [int(step) if step.isdecimal() else step for step in re.findall(r"\w+", path)]
 
 
@@ -38,6 +39,7 @@ def put(tree: Any, path: str, value: Any) -> Any:
 
 
 def _put(tree: Any, steps: list[str | int], value: Any) -> Any:
+    """Return a copy of a tree with another value at the end of these fields and indices."""
     if not steps:
         return value
     step, *rest = steps

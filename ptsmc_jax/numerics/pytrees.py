@@ -89,7 +89,7 @@ class Function:
     function: Callable = field(metadata={"static": True})
 
     def __call__(self, *args: Any) -> Any:
-        """Call the function."""
+        """Call `function` with these arguments."""
         return self.function(*args)
 
 

@@ -35,7 +35,8 @@ def scan(step: Callable[[Carry, X], tuple[Carry, Y]], init: Carry, xs: X, **opti
         return lax.scan(step, init, xs, **options)
     recorded: list[Any] = []  # tracing a step writes the structure of its outputs and their abstract values here
 
-    def step_packed(carry: Carry, x: X) -> tuple[Carry, dict[str, Array]]:
+    def step_with_packed_outputs(carry: Carry, x: X) -> tuple[Carry, dict[str, Array]]:
+        """Return the carry and the outputs after a step. The outputs of each dtype are joined into one vector."""
         carry, y = step(carry, x)
         leaves, structure = jax.tree.flatten(jax.tree.map(jnp.asarray, y))
         recorded[:] = structure, [jax.typeof(leaf) for leaf in leaves]  # no tracers, which must not leave the trace
@@ -44,7 +45,7 @@ def scan(step: Callable[[Carry, X], tuple[Carry, Y]], init: Carry, xs: X, **opti
             for dtype, indices in _group_by_dtype(leaves).items()
         }
 
-    last, rows = lax.scan(step_packed, init, xs, **options)
+    last, rows = lax.scan(step_with_packed_outputs, init, xs, **options)
     structure, leaves = recorded
     stacked: list[Any] = [None] * len(leaves)
     for dtype, indices in _group_by_dtype(leaves).items():

@@ -253,7 +253,14 @@ def strongest_drivers(drivers: Mapping[str, Mapping[str, float | None]], trials:
 
 
 def _first_order_index(bins: Sequence[np.ndarray], count: int) -> float:
-    """Return the variance between bins of `count` ranks, minus its expected value for unrelated bins."""
+    """Return the first-order Sobol index [-] of an input, at least 0.
+
+    The index is the variance of the mean rank over the bins, minus its expected value for an unrelated input.
+
+    Args:
+        bins: ranks of the metric, with variance 1, in each bin of the input.
+        count: number of all ranks.
+    """
     between = _variance_between(bins, count)
     expected = (len(bins) - 1) / max(1, count - len(bins)) * (1.0 - between)
     return max(0.0, float(between - expected))
@@ -319,13 +326,13 @@ def fewest_trials(failures: int, quantile: float, confidence: float) -> int:
     [852, 1440, 1970]
     """
 
-    def is_verified(trials: int) -> bool:
+    def is_enough(trials: int) -> bool:
         return fraction_bound(trials - failures, trials, confidence) >= quantile
 
     upper = failures + 1
-    while not is_verified(upper):
+    while not is_enough(upper):
         upper *= 2
-    return failures + 1 + bisect.bisect_left(range(failures + 1, upper), True, key=is_verified)
+    return failures + 1 + bisect.bisect_left(range(failures + 1, upper), True, key=is_enough)
 
 
 def most_extreme(values: np.ndarray, failed: np.ndarray, count: int, *, larger_is_better: bool = False) -> np.ndarray:
