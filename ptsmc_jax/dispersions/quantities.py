@@ -62,7 +62,10 @@ def level_name(name: str) -> str:
 
 
 def _normalise(q: np.ndarray) -> np.ndarray:
-    """Return unit quaternions (rows, 4). Quaternions with a norm of 1 up to rounding errors are not changed."""
+    """Return quaternions (rows, 4) divided by their norms. Norms of 1 up to rounding errors are not corrected.
+
+    Raise UnfitError if a norm differs from 1 by more than `NORM_TOLERANCE`.
+    """
     norm = np.linalg.norm(q, axis=1)
     UnfitError.check(np.abs(norm - 1.0) <= NORM_TOLERANCE, lambda k: f"a unit quaternion (its norm is {norm[k]:.9g})")
     is_normalised = np.abs(norm - 1.0) < 1e-14
@@ -120,12 +123,14 @@ def _check_flexible_body(table: TableValues, parts: Parts) -> None:
 
 
 def _disturbance_quantity(name: str, field: Literal["phase", "amplitude"], **others: Any) -> Quantity:
-    def read(parts: Parts) -> Numbers:
+    """Return the quantity of the phases or amplitudes of a disturbance; others: other fields of `Quantity`."""
+
+    def read_field(parts: Parts) -> Numbers:
         return disturbances.values(parts.disturbance, field)
 
     return Quantity(
-        lambda parts: number_names(f"{name}_", read(parts).size),
-        read,
+        lambda parts: number_names(f"{name}_", read_field(parts).size),
+        read_field,
         lambda parts, new: replace(parts, disturbance=disturbances.with_values(parts.disturbance, field, new)),
         **others,
     )

@@ -153,9 +153,10 @@ class TrialSetup(NamedTuple):
 
 
 def trial_setup(parts: Parts, dispersion: Dispersion, seed: WholeNumber, trial: WholeNumber | Row) -> TrialSetup:
-    """Write the given values of a row into the parts, and remove these quantities from the dispersion.
+    """Return parts, dispersion, seed and number of a trial, which may be a row of a run table.
 
-    Each quantity has its own random stream. Therefore the given values do not change the random quantities.
+    The given values of a row are written into the parts, and these quantities are removed from the dispersion. Each
+    quantity has its own random stream. Therefore the given values do not change the random quantities.
 
     Args:
         parts: nominal parts.

@@ -105,6 +105,7 @@ def _first_torque(run: Run) -> float:
 
 
 def _check_stabilisation(name: str, run: Run) -> Claim:
+    """Check that a chain, the case `name`, is at the origin from t_f on."""
     at_t_f, after_t_f = _error_at_and_after_t_f(run)
     start = float(_error_norm(run)[0])
     order = run.parts.controller.order
@@ -120,6 +121,7 @@ def _check_stabilisation(name: str, run: Run) -> Claim:
 
 
 def _check_accuracy(where: str, claim: str, stated: float, cases: dict[str, Run], *names: str) -> Claim:
+    """Check that the errors of these cases at and after t_f are at most the stated error [-]."""
     pairs = [_error_at_and_after_t_f(cases[name]) for name in names]
     at_t_f, after_t_f = max(p[0] for p in pairs), max(p[1] for p in pairs)
     verdict = "holds" if after_t_f <= stated else "holds in part" if at_t_f <= stated else "differs"
@@ -150,6 +152,7 @@ def _check_larger_eta_is_more_accurate(cases: dict[str, Run]) -> Claim:
 
 
 def _check_initial_torque(where: str, claim: str, cases: dict[str, Run], larger: str, smaller: str) -> Claim:
+    """Check that the first torque of the case `larger` exceeds the first torque of the case `smaller`."""
     a, b = _first_torque(cases[larger]), _first_torque(cases[smaller])
     laws = (cases[name].parts.controller for name in (larger, smaller))
     squares = [float(law.eta / law.t_f) ** 2 for law in laws]
@@ -284,6 +287,7 @@ def measure_observers() -> list[Measured]:
 
 
 def _measure_run(observer: str, sign: str) -> Measured:
+    """Simulate the scenario of Remark 2 with this kind of observer and this sign function, and measure the run."""
     table = {"kind": observer, "t_o": 1.0} if observer == "prescribed_time" else {"kind": observer}
     controller = {**_REMARK_2["controller"], "sign_width": SIGNS[sign]}
     run = runs.simulate(study(from_tables({**_REMARK_2, "observer": table, "controller": controller})))

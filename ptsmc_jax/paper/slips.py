@@ -52,7 +52,7 @@ def slips(cases: dict[str, Run]) -> list[Slip]:
 
 
 def _show_expansion_coefficients() -> Slip:
-    """Compare (36), by automatic differentiation, with (37) and the coefficients c_i."""
+    """Compare (36), by automatic differentiation, with (37) and the corrected coefficients c_i."""
     t_f, eta, t = 5.0, 4.3, 1.7
 
     def x(time: jax.Array) -> jax.Array:
@@ -60,6 +60,7 @@ def _show_expansion_coefficients() -> Slip:
 
     @jax.jit
     def relative_differences(t: jax.Array) -> jax.Array:
+        """Return the relative differences (4,) between (36) and (37) at t, for the orders 2 to 5."""
         derivative, x_derivative, states, differences = (lambda time: x(time) / (t_f - time) ** eta), x, [x(t)], []
         tau = t_f - t
         for n in (2, 3, 4, 5):
@@ -81,6 +82,7 @@ def _show_expansion_coefficients() -> Slip:
 
 
 def _show_factor_of_theorem_3() -> Slip:
+    """Show that s of Theorem 3 grows without bound, because its factor (t_f - t)^(eta+n-1) is missing."""
     tables = claims.CASES["third_order"][2]
     quiet = {"disturbance": {"amplitude": [0.0]}, "controller": {**tables["controller"], "disturbance_bound": 0.0}}
     run = runs.simulate(study(from_tables({**tables, **quiet})))
@@ -102,6 +104,8 @@ def _show_missing_term() -> Slip:
     """Simulate x'' = -K1 s - F with and without F = x', from x = 1, x' = -1 (s = 0), with K1 = 1."""
 
     def largest_s(factor: float) -> float:
+        """Return the largest |s| within 10 s; factor: 1 with the term F, 0 without it."""
+
         def rate(_: float, y: np.ndarray) -> list[float]:
             return [y[1], -(y[0] + y[1]) - factor * y[1]]
 
@@ -127,6 +131,7 @@ def _error_over_bound(run: Run, start: float) -> float:
 
 
 def _show_factor_of_bound(cases: list[Run]) -> Slip:
+    """Compare the estimation error with the bound (55), where the factor sqrt(3) is missing."""
     corrected = max(_error_over_bound(run, 0.0) for run in cases)
     printed = corrected * 3**0.5
     return Slip(
@@ -139,6 +144,7 @@ def _show_factor_of_bound(cases: list[Run]) -> Slip:
 
 
 def _show_decay_of_bound() -> Slip:
+    """Show that the bound (55) decays faster than the estimation error if J has products of inertia."""
     inertia = np.array([[12.0, 5.0, -2.0], [5.0, 11.0, 2.0], [-2.0, 2.0, 14.0]])
     gain = np.array([10.0, 10.0, 10.0])
     a = gain[:, None] * np.linalg.inv(inertia)
@@ -158,6 +164,7 @@ def _show_decay_of_bound() -> Slip:
 
 
 def _show_initial_estimate() -> Slip:
+    """Show that the estimation error exceeds K2 of (57) if the initial estimation error is wrongly assumed to be 0."""
     bound = {"disturbance_rate_bound": 1e-3}  # the published bound, not the bound 0 of a constant
     tables = {"disturbance": {"frequency": [0.0] * 3, "phase": [np.pi / 2] * 3}}  # constant
     true_bound = {**bound, "initial_estimate_error": 0.01 * 3**0.5}
@@ -176,6 +183,7 @@ def _show_initial_estimate() -> Slip:
 
 
 def _show_effective_gain() -> Slip:
+    """Show that s decays at the rate K1 / 2 after the hand-over, not at the rate K1."""
     tables = {
         "disturbance": claims.NO_DISTURBANCE,
         "controller": {"disturbance_rate_bound": 0.0, "delta": 5.0, "k1": 1.6},
@@ -205,6 +213,7 @@ class _Unaligned(AdditiveKinematics):
 
 
 def _show_sign_of_q4() -> Slip:
+    """Simulate a slew from a quaternion with the other sign of q4, with the printed and the corrected error."""
     tables = {
         "initial": {"quat_xyzw": [0.0, 0.0, 0.0, -1.0]},
         "reference": {"rotvec_deg": [0.0, 0.0, 60.0]},
@@ -234,6 +243,7 @@ def _show_sign_of_q4() -> Slip:
 
 
 def _show_growth_near_q4_zero() -> Slip:
+    """Show that the first torque grows without bound as the initial rotation angle approaches 180 deg."""
     inertia = jnp.diag(jnp.asarray([10.0, 12.0, 14.0]))
     peaks = {}
     for angle in (90.0, 170.0, 179.0):
