@@ -258,7 +258,7 @@ def test_multiplicative_error_is_singular_at_180_degrees_only():
 
 
 @pytest.mark.parametrize("hold", [False, True])
-def test_switching_rate_equals_the_change_of_acceleration_by_k2_at_the_reference(hold):
+def test_switching_rate_is_the_acceleration_that_k2_adds_at_the_reference(hold):
     """At the reference T(q) = I, and |T J^-1| has its maximum there."""
     run = parts(20.0, 3.5, 0.5, inertia=FULL_INERTIA, kinematics=KINEMATICS[1], sign_width=1e-6)
     law, t = run.controller, vector(4.0)

@@ -92,6 +92,7 @@ def phi(x, q, settling):
 
 
 def phi_derivative(x, q, settling):
+    """Return the derivative of `phi` with respect to x."""
     return np.pi / (2.0 * q * settling) * ((1.0 + q) * np.abs(x) ** q + (1.0 - q) * np.abs(x) ** -q)
 
 

@@ -100,7 +100,7 @@ def worst_error(a, sign_pattern, c, seconds):
 
 @pytest.mark.parametrize("inertia", [PAPER_INERTIA, FULL_INERTIA])
 @pytest.mark.parametrize("gain", [(10.0, 10.0, 10.0), (30.0, 3.0, 10.0)])
-def test_worst_error_is_within_the_bound_and_above_a_quarter_of_it(inertia, gain):
+def test_largest_estimation_error_is_between_a_quarter_of_its_bound_and_the_bound(inertia, gain):
     found = observer(inertia, gain)
     bound, a = found.error_bound(), np.asarray(found.decay_matrix(NOW, NOW))
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
@@ -132,8 +132,8 @@ def test_bound_for_unequal_gains_has_the_factor_root_of_their_condition_number()
 
 
 def test_derivative_of_the_bound_is_finite_for_equal_moments_of_inertia():
-    def floor(gain):
+    def bound_for_long_times(gain):
         return observer((5.0, 5.0, 5.0), jnp.full(3, gain)).error_bound().floor
 
-    derivative = jax.jit(jax.jacfwd(floor))(vector(10.0))
+    derivative = jax.jit(jax.jacfwd(bound_for_long_times))(vector(10.0))
     np.testing.assert_allclose(derivative, -np.sqrt(3) * 1e-3 * 5.0 / 100.0, rtol=1e-10)

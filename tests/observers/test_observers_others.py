@@ -54,7 +54,8 @@ def test_prescribed_time_update_for_a_full_inertia_equals_matrix_exponential():
     np.testing.assert_allclose(got, factor @ d_hat + (np.eye(3) - factor) @ impulse / h, rtol=1e-12)
 
 
-def test_updates_of_length_zero_change_nothing_and_have_finite_derivatives():
+def test_observer_update_over_a_period_of_length_zero_has_finite_derivatives():
+    """It also leaves the estimate of the prescribed-time observer unchanged."""
     for found in (prescribed_time_observer(), finite_time_observer()):
 
         def updated(dt, found=found):

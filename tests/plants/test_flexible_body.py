@@ -92,13 +92,13 @@ def test_default_steps_keep_modes_accurate_to_a_millionth_for_given_torques(simu
 
     @jax.jit
     def moved(x, t, u):
-        def period(x, now):
+        def simulate_period(x, now):
             t, t_next, u = now
             drive, _ = actuators.command(actuators.begin(3), u, x.w, t, t_next - t, jnp.ones(()))
             x = control_period.state_after(made, t, x, drive, None, t_next - t)
             return x, x
 
-        return jax.lax.scan(period, x, (t[:-1], t[1:], u[:-1]))[1]
+        return jax.lax.scan(simulate_period, x, (t[:-1], t[1:], u[:-1]))[1]
 
     found = moved(jax.tree.map(lambda v: jnp.asarray(v[0]), log.x), *map(jnp.asarray, (log.t, log.u)))
     np.testing.assert_allclose(found.modes.e, log.x.modes.e[1:], rtol=0, atol=1e-5)
@@ -160,7 +160,8 @@ def test_a_free_undamped_mode_has_the_frequency_of_the_formula():
     np.testing.assert_allclose(rates.rate, -(omega**2) * start.modes.e, rtol=1e-12)
 
 
-def test_a_random_inertia_changes_the_rigid_rest_and_impossible_bodies_are_marked():
+def test_a_random_inertia_changes_the_inertia_without_modes_and_an_impossible_body_diverges():
+    """A body with less inertia than its modes is impossible."""
     plant = body()
     drawn = plant.with_inertia(*(vector(v) for v in (1.1 * INERTIA, np.linalg.inv(1.1 * INERTIA))))
     rest = 1.1 * INERTIA - np.array(COUPLING).T @ np.array(COUPLING)
@@ -173,7 +174,7 @@ def test_a_random_inertia_changes_the_rigid_rest_and_impossible_bodies_are_marke
 
 
 @pytest.mark.parametrize("too_far", [(0,), (1,), (2,), (0, 1), (0, 2), (1, 2), (0, 1, 2)])
-def test_modes_with_more_inertia_than_the_body_are_refused(too_far):
+def test_inverse_is_nan_if_the_modes_have_more_inertia_than_the_body(too_far):
     """With two such axes, the determinant of J - D'D is positive again."""
     coupling = np.diag([1.5 if axis in too_far else 0.5 for axis in range(3)])
     plain = flexible_body.flexible(4.0 * np.eye(3), [1.0] * 3, [0.01] * 3, coupling)

@@ -32,7 +32,7 @@ SPIN = references.Spin(vector(0.1, -0.2, 0.1, np.sqrt(1 - 0.06)), vector(0.02, -
 
 
 def spacecraft_as_system(reference, inertia=FULL_INERTIA):
-    """Write a spacecraft as a system: x_1 is the error eps_1, x_2 the body rate, without derivatives by hand."""
+    """Return a spacecraft as a system x_1' = F, x_2' = H + G u + D d: x_1 is the error eps_1, x_2 the body rate."""
     tensor = vector(inertia)
     inverse = jnp.linalg.inv(tensor)
 
@@ -326,7 +326,8 @@ def test_steps_follow_the_explicit_time_of_a_system(w):
     np.testing.assert_allclose(ours.window_error, theirs.window_error, rtol=0.02)
 
 
-def test_steps_resolve_the_boundary_layer_along_the_whole_run():
+def test_sign_width_that_needs_too_many_steps_later_in_the_run_is_refused():
+    """The gain D of the disturbance grows from 1 to 100. For D = 1, this sign width is allowed."""
     steep = {"controller": {"disturbance_bound": 1.0, "sign_width": 1e-2}}
     with pytest.raises(ScenarioError, match=r"^controller\.sign_width is 0\.01, but must be larger"):
         study(one(D=lambda t, a, b: jnp.eye(1) * (1 + 99 * jnp.tanh(t))), [1.0, 0.0], **steep)

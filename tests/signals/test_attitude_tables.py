@@ -69,7 +69,7 @@ def test_attitude_rate_and_acceleration_are_continuous():
         np.testing.assert_allclose(getattr(before, name), getattr(after, name), rtol=0, atol=1e-11)
 
 
-def test_rates_are_the_derivatives_of_the_quaternion():
+def test_interpolated_rates_are_the_derivatives_of_the_quaternion():
     reference = references.interpolate_attitude(UNEVEN, wander(UNEVEN))
     for t in (0.3, 2.5, 8.0):
         by_derivative = references.target_of(lambda t: reference(t).q, jnp.asarray(t))
@@ -78,7 +78,7 @@ def test_rates_are_the_derivatives_of_the_quaternion():
             np.testing.assert_allclose(getattr(got, name), getattr(by_derivative, name), rtol=0, atol=1e-13)
 
 
-def test_far_from_the_ends_it_equals_the_rotation_spline_of_scipy():
+def test_interpolated_attitude_far_from_the_ends_equals_the_rotation_spline_of_scipy():
     times = np.arange(0.0, 40.0, 0.25)
     reference, other = (
         references.interpolate_attitude(times, wander(times)),

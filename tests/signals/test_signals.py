@@ -185,8 +185,8 @@ def test_a_custom_disturbance_can_have_a_number_called_terms():
     assert (type(changed), float(changed.size), changed.terms) == (Push, 0.2, 2.0)
 
 
-def test_with_bias_replaces_the_previous_bias():
-    """A row of a run table may give a bias to parts that have one already."""
+def test_with_bias_replaces_the_previous_bias_of_a_disturbance():
+    """A row of a run table may give a bias to a disturbance that has one already."""
     constant = disturbances.Constant(vector([0.1, -0.2, 0.3]))
     biased = constant
     for value in ([0.01, 0.02, 0.03], [1e-3, 0.0, -1e-3]):

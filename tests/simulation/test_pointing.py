@@ -233,7 +233,7 @@ def simulated():
     return ready, fly(ready.parts, 3, 5)
 
 
-def test_indices_of_a_run_match_its_history(simulated):
+def test_pointing_indices_of_a_run_match_its_history(simulated):
     ready, result = simulated
     frame = np.array(ready.parts.pointing.frame)
     log = result.log

@@ -46,7 +46,8 @@ def perfect(run: rollout.Parts) -> rollout.Parts:
     return replace(run, disturbance=quiet, observer=bound)
 
 
-def reference_run(case: dict) -> rollout.Parts:
+def parts_of_reference_case(case: dict) -> rollout.Parts:
+    """Return the parts that simulate a case of the reference data, with its times in the history."""
     # the reference data use c instead of sqrt(3) c in (55)
     times = [row["t"] for row in case["trajectory"]]
     run = parts(case["t_f"], case["eta"], case["delta"], rate_bound=1e-3 / np.sqrt(3.0), saves=times)
@@ -58,7 +59,7 @@ def reference_run(case: dict) -> rollout.Parts:
 
 @pytest.mark.parametrize("case", REFERENCE["cases"], ids=lambda case: case["name"])
 def test_the_continuous_loop_matches_an_independent_integration(case):
-    run = reference_run(case)
+    run = parts_of_reference_case(case)
     result = fly(run)
     log = result.log
     steps = log.t.size - 1
@@ -348,7 +349,7 @@ def test_gains_beyond_the_clock_are_refused():
 
 def test_a_t_f_beyond_the_grid_of_the_continuous_loop_is_refused():
     """Twice the t_f of the grid leaves too few steps near t_f. Earlier the window error was wrong by 66 %."""
-    run = reference_run(REFERENCE["cases"][0])
+    run = parts_of_reference_case(REFERENCE["cases"][0])
     codes = {t_f: int(fly(run.with_t_f(vector(t_f))).status) for t_f in (30.0, 45.0, 60.0, 90.0)}
     assert codes == {30.0: rollout.OK, 45.0: rollout.OK, 60.0: rollout.INCOMPLETE, 90.0: rollout.INCOMPLETE}
     assert float(with_gains(run, {"t_f": 45.0}).controller.t_f) == 45.0

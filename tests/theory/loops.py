@@ -55,11 +55,11 @@ def larger(loop, n, k, m):
     sizes = {"a": (n, n), "seen": (n, k), "new": (n, m), "old": (n, m), "command": (m, n), "direct": (m, k),
              "disturbed": (n, m)}  # fmt: skip
 
-    def grown(v, sizes):
+    def pad_with_zeros(v, sizes):
         more = [(0, to - size) for to, size in zip(sizes, np.shape(v)[-2:], strict=True)]
         return np.pad(np.asarray(v), [(0, 0)] * (np.ndim(v) - 2) + more)
 
-    all_of = replace(loop, **{name: grown(getattr(loop, name), to) for name, to in sizes.items()})
+    all_of = replace(loop, **{name: pad_with_zeros(getattr(loop, name), to) for name, to in sizes.items()})
     return jax.tree.map(np.asarray, all_of)  # NumPy arrays, because weak types would compile another program
 
 

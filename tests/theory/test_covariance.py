@@ -169,8 +169,8 @@ def test_propagated_state_has_the_dynamics_of_the_closed_loop(delay):
     np.testing.assert_allclose(commanded.state[0], np.pad(at_input.c, ((0, 0), (0, m))), rtol=0.0, atol=1e-14)
 
 
-def test_noise_does_not_apply_to_implicit_sampling():
-    """For noise beyond the reach of the switching term the predicted torque would be 13 times too large."""
+def test_covariance_analysis_does_not_apply_to_implicit_sampling_or_perfect_sensors():
+    """With implicit sampling and noise beyond the reach of the switching term, it would predict 13 times the torque."""
     parts = scenario.study(scenario.from_tables({"loop": {"mode": "sampled"}, "hardware": {"rate_noise": 1e-6}})).parts
     assert covariance.is_applicable(parts)
     assert not covariance.is_applicable(replace(parts, controller=replace(parts.controller, implicit=True)))

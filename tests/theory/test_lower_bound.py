@@ -81,9 +81,12 @@ def by_least_squares(move, push, rows, noise, prior, output, delay):
     return found
 
 
-def pooled_in_window(made, squares):
-    """RMS over the window, by Simpson's rule, of squares at start, middle and end of each period (periods, 3)."""
-    t_f, window = float(made.controller.t_f), float(made.window)
+def rms_in_window(parts, squares):
+    """Return the root of the mean of squares over the window of the run, by Simpson's rule.
+
+    squares: values at the start, middle and end of each period, (periods, 3).
+    """
+    t_f, window = float(parts.controller.t_f), float(parts.window)
     inside = slice(round(t_f / PERIOD), round((t_f + window) / PERIOD))
     return np.sqrt(np.sum(squares[inside] @ np.array([1, 4, 1]) / 6) * PERIOD / window)
 
@@ -137,7 +140,7 @@ def test_lower_bound_of_a_chain_equals_least_squares(order, delay):
     squares = by_least_squares(move, push, np.eye(n, n + 1), noise, prior, output, delay)
     # 1e-9: the initial deviation of 1e5 sigma changes the variance after one sample by 1e-10
     np.testing.assert_allclose(found.error[delay:], np.sqrt(squares[delay:, 2]), rtol=1e-9)
-    np.testing.assert_allclose(found.window_error, pooled_in_window(made, squares), rtol=1e-9)
+    np.testing.assert_allclose(found.window_error, rms_in_window(made, squares), rtol=1e-9)
 
 
 def test_lower_bound_uses_the_actual_sample_times():
@@ -215,7 +218,7 @@ def test_lower_bound_of_a_spacecraft_at_rest_equals_least_squares(kind):
         output = np.stack([expm(a * t)[0] / 2 for t in (0.0, PERIOD / 2, PERIOD)])
         squares += by_least_squares(move, move @ steps, rows, noise, prior, np.hstack([output, output @ steps]), 1)
     np.testing.assert_allclose(found.error[1:], np.sqrt(squares[1:, 2]), rtol=1e-8)  # numbers differ by 1e10
-    np.testing.assert_allclose(found.window_error, pooled_in_window(made, squares), rtol=1e-8)
+    np.testing.assert_allclose(found.window_error, rms_in_window(made, squares), rtol=1e-8)
 
 
 def test_along_each_equals_separate_calls():

@@ -14,7 +14,7 @@ from ptsmc_jax.simulation import rollout
 from ptsmc_jax.theory import covariance, lower_bound
 from tests import suites
 from tests.helpers import parts, vector
-from tests.theory.test_lower_bound import AT_REST, PERIOD, delayed, pooled_in_window, simulated_at, still
+from tests.theory.test_lower_bound import AT_REST, PERIOD, delayed, rms_in_window, simulated_at, still
 
 
 def history(moments, walks):
@@ -85,7 +85,7 @@ def test_lower_bound_with_two_star_trackers_equals_an_independent_kalman_filter(
                 asked = state(k + 1, t)[:3] / 2
                 squares[k + 1, i] = np.trace(asked @ p @ asked.T)
     np.testing.assert_allclose(found.error[1:], np.sqrt(squares[1:, 2]), rtol=1e-9)
-    np.testing.assert_allclose(found.window_error, pooled_in_window(made, squares), rtol=1e-9)
+    np.testing.assert_allclose(found.window_error, rms_in_window(made, squares), rtol=1e-9)
 
 
 def test_covariance_predicts_the_error_of_simulated_trials_with_a_suite():
