@@ -233,7 +233,8 @@ def set_by_hand(parts, row):
     """Return the nominal parts with every value of a spacecraft row."""
     row = dict(row)
 
-    def numbers(name, count):
+    def take_vector(name, count):
+        """Remove the columns name1, name2, .. from the row and return them as a vector."""
         return vector([row.pop(f"{name}{k}") for k in range(1, count + 1)])
 
     for what in (*made_of_a_run(), "initial_angle"):
@@ -243,20 +244,20 @@ def set_by_hand(parts, row):
         for j in range(i, 3):
             inertia[i, j] = inertia[j, i] = row.pop(f"inertia_{i + 1}{j + 1}")
     sinusoid, gradient = parts.disturbance.terms
-    phases, amplitudes = numbers("disturbance_phase_", 4), numbers("disturbance_amplitude_", 3)
+    phases, amplitudes = take_vector("disturbance_phase_", 4), take_vector("disturbance_amplitude_", 3)
     acting = disturbances.Sum((
         dataclasses.replace(sinusoid, phase=phases[:3], amplitude=amplitudes),
         dataclasses.replace(gradient, phase=phases[3], inertia=vector(inertia)),
-        disturbances.Constant(numbers("disturbance_bias_", 3)),
+        disturbances.Constant(take_vector("disturbance_bias_", 3)),
     ))  # fmt: skip
     noises = {name: vector(row.pop(name)) for name in ("attitude_noise", "rate_noise")}
     by_hand = dataclasses.replace(
         parts,
         plant=rigid_body.spacecraft(inertia),
         disturbance=acting,
-        initial=rigid_body.AttitudeState(numbers("initial_q", 4), numbers("initial_w", 3)),
-        reference=dataclasses.replace(parts.reference, q=numbers("reference_q", 4)),
-        sensors=dataclasses.replace(parts.sensors, given_bias=numbers("rate_bias_", 3), **noises),
+        initial=rigid_body.AttitudeState(take_vector("initial_q", 4), take_vector("initial_w", 3)),
+        reference=dataclasses.replace(parts.reference, q=take_vector("reference_q", 4)),
+        sensors=dataclasses.replace(parts.sensors, given_bias=take_vector("rate_bias_", 3), **noises),
         actuators=dataclasses.replace(parts.actuators, torque_limit=vector(row.pop("torque_limit"))),
     )
     assert not row  # the row has no other inputs

@@ -89,12 +89,12 @@ def recorded(summary, command="tune"):
 
 @pytest.mark.parametrize(("force", "same"), [(False, "the same command"), (True, "the same command without --force")])
 def test_search_interrupted_during_writing_resumes(tmp_path, shown, force, same):
-    def stopped(making, outcome):
-        (making / "summary.json").write_text(outcome.status)
+    def write_then_interrupt(folder, outcome):
+        (folder / "summary.json").write_text(outcome.status)
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt, match=f"^{same} resumes it$"):
-        searches.run(search_of("met", stopped), LOADED, tmp_path / "out", force=force, quiet=False)
+        searches.run(search_of("met", write_then_interrupt), LOADED, tmp_path / "out", force=force, quiet=False)
     assert shown == []
     assert set(tree(tmp_path / "out")) == {"journal.bin", "scenario.toml", "versions.json"}
 

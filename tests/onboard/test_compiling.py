@@ -31,7 +31,7 @@ def parts(name, **loop):
 
 
 @needs_compiler
-def test_an_invalid_controller_raises_an_error(chain, tmp_path):
+def test_a_controller_that_is_absent_or_does_not_fit_or_compile_raises_an_error(chain, tmp_path):
     with pytest.raises(ScenarioError, match=r"^the controller is .*nothing, but must be a folder that ptsmc export"):
         Library(tmp_path / "nothing")
     library = Library(chain)

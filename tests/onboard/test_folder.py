@@ -95,14 +95,14 @@ def test_every_registered_law_replays_the_simulation(plant, kind, tmp_path):
 
 
 class Odd(ptsmc.AccelerationLaw):
-    """A law whose memory has whole numbers, nothing at all, and names that no field of a struct has."""
+    """A law whose memory has integers, an empty array, and names that are not allowed in a C struct."""
 
     def begin(self) -> Any:
-        """The memory, of [-] all."""
+        """Return the initial memory [-]."""
         return {"none": jnp.zeros(0), "I": jnp.zeros(3), "i": jnp.zeros((2, 3), int), "a b": jnp.zeros(()), "a-b": 0.0}
 
     def acceleration(self, now: Any, error: Any, error_rate: Any, bound: Any) -> Any:
-        """PD, the sliding variable by its sign."""
+        """Return the acceleration of a PD law with the memory added, the sign of the error as s, and the memory."""
         memory = now.memory
         whole = jnp.sign(error).astype(int)
         kept = {**memory, "I": memory["I"] + error, "i": jnp.stack([memory["i"][1] - 1, memory["i"].sum() % 3 - whole])}
@@ -110,7 +110,7 @@ class Odd(ptsmc.AccelerationLaw):
 
 
 class Named(ptsmc.AccelerationLaw):
-    """PD whose names and words are C's."""
+    """A PD law with a variable and a description that would be wrong in C: a name in use, and comment marks."""
 
     k: float = ptsmc.gain(1.0, (0.1, 10.0), meaning="of v, */ and of /* v", unit="1/s^2")
 

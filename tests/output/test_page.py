@@ -102,7 +102,7 @@ def test_the_body_turns_as_it_flew(simulated):
     ("not_converged", "bad", "the run failed: not converged"),
     ("diverged", "bad", "the run failed: diverged"),
 ])  # fmt: skip
-def test_the_verdict_comes_first(simulated, status, mood, said):
+def test_the_verdict_is_the_first_content_of_the_page(simulated, status, mood, said):
     summary = json.loads((simulated / "summary.json").read_text())
     verdict = {**summary["verdicts"]["peak_torque"], "limit": 30.0, "margin": 0.5, "met": True}
     summary.update(status=status, reason="", verdicts={"peak_torque": verdict})
@@ -194,7 +194,7 @@ def test_a_result_file_that_is_a_link_out_of_the_folder_is_refused(command, simu
 
 @pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
 @pytest.mark.parametrize("hostile", short([False, True], [True]))
-def test_chromium_draws_it_without_an_error_or_a_request(simulated, tmp_path, hostile):
+def test_chromium_draws_the_page_without_an_error_or_a_request(simulated, tmp_path, hostile):
     """The policy forbids requests and foreign scripts. The console would show a forbidden attempt."""
     folder = hostile_folder(simulated) if hostile else simulated
     place = tmp_path / "page.html"

@@ -388,8 +388,9 @@ def budget(simulated: int, ok: int, not_converged: int = 0) -> str:
     return [*campaign_report.budget_lines(campaign, campaign.pointing)][-1]
 
 
-def winner(least: float) -> str:
-    errors = {"pd": least, "prescribed_time": 4e-6}
+def most_accurate_law(pd_error: float) -> str:
+    """Return the sentence on the most accurate law of a comparison with PD, for this window error of PD."""
+    errors = {"pd": pd_error, "prescribed_time": 4e-6}
     laws = examples.compare({name: examples.law(window_error=error) for name, error in errors.items()}).laws
     return compare_report.most_accurate_law(laws)
 
@@ -488,7 +489,7 @@ OTHERS: dict[str, Callable[[], Any]] = {
     "pointing budget without an angle": lambda: [
         budget(2000, 2000), budget(1108, 1098), budget(1109, 1099), budget(1109, 1049, 50),
     ],
-    "most accurate law, also without an error": lambda: [winner(2e-6), winner(0.0)],
+    "most accurate law, also without an error": lambda: [most_accurate_law(2e-6), most_accurate_law(0.0)],
     # the bound is 0 without noise, and None if no run reaches its end
     "angles of a campaign in arcsec and deg": quantiles_of_angles,
     "run without a lower bound": lambda: [text_of(run(None)), text_of(run(0.0))],

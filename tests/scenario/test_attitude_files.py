@@ -36,7 +36,8 @@ def message(rows, version="1.0", dates=DATES, marks=True, **changed):
     return HEAD.format(version=version) + "\n".join(["META_START", *lines, "META_STOP", *data, ""])
 
 
-def read(path, content, order=None, direction=None, interpolation="file", epoch=None):
+def write_and_read(path, content, order=None, direction=None, interpolation="file", epoch=None):
+    """Write text or a data frame to a file, and return the attitudes that the program reads from it."""
     if isinstance(content, str):
         path.write_text(content)
     elif path.suffix == ".parquet":
@@ -77,12 +78,14 @@ TABLES = {
 @pytest.mark.parametrize(("frame", "options"), TABLES.values(), ids=TABLES)
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
 def test_tables_in_every_order_give_the_same_attitudes(tmp_path, suffix, frame, options):
-    check(read(tmp_path / f"attitude.{suffix}", frame, **options))
+    check(write_and_read(tmp_path / f"attitude.{suffix}", frame, **options))
 
 
 def test_epoch_is_the_time_0_of_calendar_times(tmp_path):
     frame = TABLES["dates"][0]
-    assert read(tmp_path / "a.csv", frame, epoch="2026-03-21T00:00:00").times[0] == pytest.approx(-2.0, abs=1e-12)
+    assert write_and_read(tmp_path / "a.csv", frame, epoch="2026-03-21T00:00:00").times[0] == pytest.approx(
+        -2.0, abs=1e-12
+    )
 
 
 RATE = np.rad2deg(np.tile(0.05 * AXIS, (5, 1)))  # [deg/s]
@@ -123,7 +126,7 @@ MESSAGES = {
 
 @pytest.mark.parametrize(("text", "quaternions"), MESSAGES.values(), ids=MESSAGES)
 def test_messages_in_every_style_give_the_same_attitudes(tmp_path, text, quaternions):
-    samples = read(tmp_path / "attitude.aem", text)
+    samples = write_and_read(tmp_path / "attitude.aem", text)
     check(samples, quaternions)
     if samples.end_rates is not None:
         np.testing.assert_allclose(samples.end_rates, np.deg2rad(RATE[:2]), atol=1e-12)
@@ -133,12 +136,12 @@ def test_segments_are_chosen_by_the_epoch_and_not_joined(tmp_path):
     later = [date.replace("03-20", "03-25").replace("03-21", "03-26") for date in DATES]
     second = message(S, dates=later, START_TIME=later[0], STOP_TIME=later[-1], USEABLE_STOP_TIME=later[-2])
     both = message(Q) + second[second.index("META_START") :]
-    check(read(tmp_path / "a.aem", both))
-    samples = read(tmp_path / "a.aem", both, epoch=later[0])
+    check(write_and_read(tmp_path / "a.aem", both))
+    samples = write_and_read(tmp_path / "a.aem", both, epoch=later[0])
     check(samples, S)
     assert samples.usable_until == pytest.approx(TIMES[-2])
     with pytest.raises(ValueError, match="no segment contains"):
-        read(tmp_path / "a.aem", both, epoch="2026-03-23T00:00:00")
+        write_and_read(tmp_path / "a.aem", both, epoch="2026-03-23T00:00:00")
 
 
 REFUSED = {
@@ -164,11 +167,11 @@ REFUSED = {
 @pytest.mark.parametrize(("text", "named"), REFUSED.values(), ids=REFUSED)
 def test_messages_that_cannot_be_followed_are_refused_with_their_place(tmp_path, text, named):
     with refuses(ValueError, named):
-        read(tmp_path / "attitude.aem", text)
+        write_and_read(tmp_path / "attitude.aem", text)
 
 
 def test_another_interpolation_is_allowed_by_key(tmp_path):
-    check(read(tmp_path / "a.aem", message(Q, INTERPOLATION_METHOD="LINEAR"), interpolation="spline"))
+    check(write_and_read(tmp_path / "a.aem", message(Q, INTERPOLATION_METHOD="LINEAR"), interpolation="spline"))
 
 
 GOOD = TABLES["numbered"][0]

@@ -526,7 +526,9 @@ def test_a_law_integrates_the_error_in_its_memory():
 def test_the_first_sample_of_a_law_sees_the_initial_error(clock):
     """The anchored clock begins with periods of length zero, which must not change the memory."""
 
-    class First(ptsmc.AccelerationLaw):
+    class InitialErrorLaw(ptsmc.AccelerationLaw):
+        """A law that stores the first error in its memory and returns it as s."""
+
         k: float = ptsmc.gain(1.0, (0.1, 2.0))
 
         def begin(self):
@@ -536,7 +538,7 @@ def test_the_first_sample_of_a_law_sees_the_initial_error(clock):
             start = jnp.where(now.t == 0.0, error, now.memory)
             return -self.k * error - 2.0 * error_rate, start, start
 
-    table = {"kind": "custom", "code": First, "t_f": 5.03, "delta": 0.5}  # not a whole number of periods
+    table = {"kind": "custom", "code": InitialErrorLaw, "t_f": 5.03, "delta": 0.5}  # not a whole number of periods
     log = simulated({**CHAIN, "controller": table, "loop": {**SAMPLED, "clock": clock}}).log
     kept = np.asarray(log.has_length)
     assert kept.any()

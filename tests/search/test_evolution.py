@@ -26,6 +26,7 @@ class Valley(Evaluator):
         self.seen = []
 
     def measure(self, problem, normalised):
+        """Return F and the constraint of normalised gains (points, gains), and record x in `seen`."""
         x = normalised - 0.5
         self.seen.append(x)
         f = np.where(x[:, 0] > self.wall, np.nan, np.einsum("pi,ij,pj->p", x, self.matrix, x))
@@ -46,7 +47,7 @@ def refined(valley, start, seed=3, size=evolution.WHOLE_BOX):
     return best, told
 
 
-def narrow(count):
+def ill_conditioned(count):
     """Return a rotated symmetric matrix with eigenvalues from 1 to 400."""
     turn, _ = np.linalg.qr(np.random.default_rng(7).normal(size=(count, count)))
     return turn @ np.diag(np.geomspace(1.0, 400.0, count)) @ turn.T
@@ -54,7 +55,7 @@ def narrow(count):
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_minimum_of_an_ill_conditioned_rotated_quadratic_with_a_wall_is_found(seed):
-    best, told = refined(Valley(narrow(3), wall=0.2), [-0.35, 0.3, -0.3], seed)
+    best, told = refined(Valley(ill_conditioned(3), wall=0.2), [-0.35, 0.3, -0.3], seed)
     # the search ends if `PATIENCE` generations reduce F by less than `LEAST_DECREASE`, so a few times that can remain
     assert best.f < 5.0 * evolution.LEAST_DECREASE
     assert np.isfinite(best.f)
@@ -63,7 +64,7 @@ def test_minimum_of_an_ill_conditioned_rotated_quadratic_with_a_wall_is_found(se
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_constrained_optimum_on_an_active_limit_is_found(seed):
-    matrix, along, least = narrow(3), np.array([1.0, 0.5, -0.4]), 0.2
+    matrix, along, least = ill_conditioned(3), np.array([1.0, 0.5, -0.4]), 0.2
     inverse = along @ np.linalg.solve(matrix, along)
     optimum = least**2 / inverse  # at x = A^-1 a b / (a' A^-1 a)
     best, _ = refined(Valley(matrix, along, least), [0.35, 0.3, -0.3], seed)

@@ -76,12 +76,12 @@ def test_reading_does_not_change_the_file(tmp_path):
 
 
 def test_records_of_other_questions_are_removed_only_after_the_answer_is_computed(tmp_path):
-    def killed():
+    def interrupt():
         raise KeyboardInterrupt
 
     ask(Journal(tmp_path / "j"), 3, [])
     data = (tmp_path / "j").read_bytes()
     journal = Journal(tmp_path / "j")
     with pytest.raises(KeyboardInterrupt):
-        journal.get(b"another", killed)
+        journal.get(b"another", interrupt)
     assert (tmp_path / "j").read_bytes() == data

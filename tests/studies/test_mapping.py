@@ -185,7 +185,8 @@ def test_a_map_says_which_pairs_keep_every_requirement(monkeypatch):
     )
     asked = []
 
-    def judge_loop(parts, required, *, finished):
+    def record_and_judge(parts, required, *, finished):
+        """Record the call, and return the verdict on a margin of 9 dB."""
         asked.append(([one.metric for one in required], finished))
         return [required[0].verdict(np.asarray(9.0), np.asarray(finished))]
 
@@ -194,7 +195,7 @@ def test_a_map_says_which_pairs_keep_every_requirement(monkeypatch):
         metrics = Metrics(dict.fromkeys(CATALOGUE, np.zeros(4)) | {"peak_torque": peaks})
         return montecarlo.Trials(np.arange(4), metrics, np.full(4, rollout.OK), np.full(4, np.nan), {})
 
-    monkeypatch.setattr(mapping.margin_verdicts, "judge_loop", judge_loop)
+    monkeypatch.setattr(mapping.margin_verdicts, "judge_loop", record_and_judge)
     monkeypatch.setattr(montecarlo, "run", run)
     _, _, _, cells = simulated("controller.eta=3:4:2", "controller.delta=0.4:0.5:2", text, trials=4)
     assert [cell.meets for cell in cells] == [1, 0, 1, 0]

@@ -188,12 +188,13 @@ class Rising:
         lower, upper = zip(*made.search.bounds.values(), strict=True)
         bounds = normalisation.Bounds(names, lower, upper)
 
-        def fly(problem: Any, normalised: np.ndarray) -> Any:
+        def measure(problem: Any, normalised: np.ndarray) -> Any:
+            """Return F = -ln K1, without simulation."""
             k1 = np.array([bounds.gains(one)[names.index("k1")] for one in normalised])
             return SimpleNamespace(f=-np.log(k1), largest_c=np.zeros(len(k1)))
 
         self.evaluate = Evaluator(bounds)
-        self.evaluate.measure = fly
+        self.evaluate.measure = measure
 
     def search(self, problem: Any, gains: Any, starts: int, report: Any) -> Found:
         self.searched.append(dict(self.ready.scenario.search.bounds))
