@@ -60,7 +60,7 @@ def _show_expansion_coefficients() -> Slip:
 
     @jax.jit
     def relative_differences(t: jax.Array) -> jax.Array:
-        """Return the relative differences (4,) between (36) and (37) at t, for the orders 2 to 5."""
+        """Return the relative differences of (36) and (37) at t for each order from n = 2."""
         derivative, x_derivative, states, differences = (lambda time: x(time) / (t_f - time) ** eta), x, [x(t)], []
         tau = t_f - t
         for n in (2, 3, 4, 5):

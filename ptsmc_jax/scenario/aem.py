@@ -1,8 +1,8 @@
 """CCSDS attitude ephemeris messages (AEM, CCSDS 504.0-B-1 and 504.0-B-2) as text in keyword-value notation.
 
-Start with `read_segment` and `format_message`. The standard's rotation from frame A to frame B is a change of
-components, x_B = M x_A. If A is inertial and B the body, its quaternion (Q1, Q2, Q3, QC) is the quaternion of this
-package, from body to inertial axes.
+Start with `read_segment` and `format_message`. The standard's rotation from frame A to frame B converts components,
+x_B = M x_A. The quaternion of this package rotates vectors from body to inertial axes. If A is inertial and B is the
+body, it equals the quaternion (Q1, Q2, Q3, QC) of the standard.
 """
 
 import datetime as dt
@@ -32,7 +32,7 @@ class Block:
     data: list[tuple[str, int]] = field(default_factory=list)
 
     def get(self, name: str, default: str | None = None) -> str:
-        """Return the value of a keyword in capitals; raise ValueError if it is absent without default."""
+        """Return the value of a keyword, converted to capitals. Raise ValueError if it is absent and has no default."""
         if name not in self.keywords and default is None:
             raise ValueError(f"a segment has no {name}, which the standard demands")
         return self.keywords[name][0].upper() if name in self.keywords else str(default)

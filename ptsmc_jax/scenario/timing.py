@@ -32,7 +32,7 @@ from ptsmc_jax.theory import envelopes, solutions
 MOST_SUBSTEPS = 200  # largest number of integration steps in a control period
 # keys of smooth motions: steps of 0.1 rad are accurate enough, see `_count_substeps`
 _SMOOTH_MOTIONS = ("disturbance.frequency", "plant.system", "flexible.frequency")
-_REMEDIES = {  # how a key must change, other than to lower numbers, so that a run needs fewer steps
+_REMEDIES = {  # how the value of a key must change so that a run needs fewer steps; all other values must be lower
     "reference.duration": "longer",
     "controller.t_f": "longer",
     "controller.sign_width": "larger, or 0 for the discontinuous sign",
@@ -70,8 +70,8 @@ def reach_of(scenario: Scenario, **changes: float) -> Reach:
         changes: fields of `Reach` with other values.
 
     Raises:
-        ValueError: there is no such field, a value is not finite, is negative or is a time of 0, or a smallest value
-            exceeds its largest value.
+        ValueError: there is no such field. Or a value is negative, not finite, or 0 for a time. Or the smallest value
+            of a range exceeds its largest value.
         TypeError: `scenario` is not a scenario.
 
     >>> from ptsmc_jax.scenario import from_tables
@@ -154,7 +154,10 @@ def _check_steps(scenario: Scenario, last_time: float, period: float, substeps: 
 
 
 def _fastest_frequency(frequencies: Mapping[str, float]) -> float:
-    """Return the highest angular frequency of the motion [rad/s]: of the disturbance, or the sum of all others."""
+    """Return the highest angular frequency of the motion [rad/s].
+
+    It is the frequency of the disturbance or the sum of all other frequencies, whichever is larger.
+    """
     others = sum(value for key, value in frequencies.items() if key != "disturbance.frequency")
     return max(frequencies["disturbance.frequency"], others)
 
@@ -182,7 +185,7 @@ def _too_fast_error(scenario: Scenario, key: str, reason: str) -> ScenarioError:
     key = "controller.t_f" if key == "controller.eta" else key  # eta may be at its lower bound already
     table, *names = key.split(".")
     value = functools.reduce(lambda one, name: getattr(one, name, None), names, getattr(scenario, table))
-    if value is None:  # the key belongs to terms of a sum of disturbances, or to none of them
+    if value is None:  # the key is in the terms of a sum of disturbances, or the scenario does not have it
         value = [getattr(term, names[-1]) for term in scenario.terms if hasattr(term, names[-1])]
     if not value or names[-1] in ("system", "code", "file", "kind"):
         named = f"{key} is {show(value)}, which" if isinstance(value, str) else key if value else table

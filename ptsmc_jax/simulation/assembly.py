@@ -33,7 +33,7 @@ class Parts:
     window: Leaf  # length of the window after t_f, for window_error [s]
     settling_angle: Leaf  # a run has settled when its angle stays below this limit, for `settling_time` [rad]
     actuators: Actuators = field(default_factory=Actuators)  # by default they hold the commanded torque over a period
-    walk_rate: Leaf | None = None  # (m,) 1 sigma of a random-walk step of the disturbance per period length [N m/s]
+    walk_rate: Leaf | None = None  # (m,) 1 sigma of the disturbance's random-walk step, divided by the period [N m/s]
     command_filter: CommandFilter | None = None  # filter between the law and the actuators
     jitter: Leaf | None = None  # largest error of a sample time, as a fraction of the control period [-]
     pointing: Pointing | None = None  # observation of pointing errors; None: the run has no pointing metrics
@@ -49,7 +49,7 @@ class Parts:
 
     @property
     def aligned_initial(self) -> PyTree:
-        """The initial state in the form that the law can bring to the reference, see `Kinematics.align`."""
+        """The initial state as the law needs it, for example with the other sign of q, see `Kinematics.align`."""
         return self.controller.kinematics.align(self.initial, self.reference(jnp.zeros_like(self.t_end)))
 
     @property

@@ -39,9 +39,9 @@ class Sampled:
     """Control clock of a sampled loop: an anchored clock, or the clock of a flight computer.
 
     Anchored clock: samples are whole periods before and after the hand-over, so all samples and their noise move with
-    it. A run depends smoothly on delta and t_f. The first period, from t = 0, is partial. Its noise is blended with the
-    noise of the next sample, so that no state jumps when the partial period vanishes. At that point derivatives by
-    delta and t_f are one-sided, and the chattering jumps by the contribution of one sample.
+    it. A run depends smoothly on delta and t_f. The first period, from t = 0, is partial. For some delta and t_f its
+    length is zero. Its noise is blended with the noise of the next sample, so that the states are continuous there.
+    Derivatives by delta and t_f are one-sided there, and the chattering jumps by the contribution of one sample.
 
     Flight clock: sample k is at k periods from t = 0. The hand-over is the first sample at or after t_f - delta.
 
@@ -73,7 +73,7 @@ class Sampled:
         )
         t, t_next = nodes[:-1], nodes[1:]
         sample = numbers[:-1] - jnp.where(is_anchored, before, 0)
-        # the start of a period decides, because rounding may make its length equal to a full period or longer
+        # a period that starts at t = 0 is partial, even if rounding makes it as long as a full period or longer
         partial = ~has_started[:-1]
         fraction = jnp.where(partial, (t_next - t) / self.period, 1.0)
         # rounding must not delay the hand-over of a flight computer
@@ -84,9 +84,10 @@ class Sampled:
 @pytree
 @dataclass(frozen=True)
 class Graded:
-    """Integration grid of the continuous loop, graded toward t_f; nodes at t_s, t_f, t_f + window and `saves`.
+    """Integration grid of the continuous loop, with shorter steps near t_f.
 
-    Before the hand-over nodes are uniform in a ln(tau) + tau / max_step, tau = t_f - t, and uniform after it.
+    The hand-over t_s = t_f - delta, t_f, t_f + window and `saves` are nodes. Before the hand-over, the nodes have equal
+    distances in the variable a ln(tau) + tau / max_step, with tau = t_f - t. After it, they have equal distances in t.
     """
 
     t_end: Leaf  # [s]

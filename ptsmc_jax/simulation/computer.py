@@ -24,7 +24,7 @@ class Computer(NamedTuple):
     observer: PyTree  # memory of the observer
     law: PyTree  # memory of the law; None: the law has no memory
     # mean torque [N m] and wheel momentum [N m s] of the last period, as the flight software assumes them
-    applied: tuple[Array, Array | None] | None  # None: the actuators hold `control_period.State.torque` exactly
+    applied: tuple[Array, Array | None] | None  # None: it is `control_period.State.torque`, held exactly
     command_filter: PyTree = None  # memory of the command filter; None: there is no filter
 
 

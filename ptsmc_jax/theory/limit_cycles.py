@@ -33,7 +33,7 @@ FEWEST_PERIODS = 16  # Smallest number of full hold periods for a decision.
 FEWEST_REVERSALS = 4  # Smallest number of reversals of the command.
 SLOWEST = 40  # Largest mean number of samples between two reversals.
 SUSTAINED = 0.75  # Smallest ratio of the command's variation in the second half of the examined periods to the first.
-NONLINEAR = 0.1  # Smallest nonlinear fraction of a limit cycle: residual relative to the change of the command.
+NONLINEAR = 0.1  # Smallest ratio of the residual (module docstring) to u(x_0) - u(x), peak to peak, of a limit cycle.
 ROUNDING = 1e-8  # Rounding error of commands, relative to the largest command.
 
 
@@ -106,7 +106,7 @@ def _measure_cycle(u: np.ndarray, residual: np.ndarray) -> LimitCycle:
 
 
 def _sign_changes(values: np.ndarray, threshold: Any) -> np.ndarray:
-    """Return whether each value above `threshold` in size differs in sign from the next one, bool; values (times,)."""
+    """Remove values (times,) of at most `threshold` in size. Return whether each sign differs from the next, bool."""
     signs = np.sign(values[np.abs(values) > threshold])
     return signs[1:] != signs[:-1]
 

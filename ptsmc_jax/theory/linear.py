@@ -50,8 +50,8 @@ class Loop:
 
     a: Leaf  # (n, n) A, derivative of z' by z
     seen: Leaf  # (n, k) B, derivative of z' by x_seen
-    new: Leaf  # (nodes, n, m) N, derivative of z' by u_new, if it acts from each fraction of `NODES` on
-    old: Leaf  # (nodes, n, m) O, derivative of z' by u_old, for the same fractions
+    new: Leaf  # (nodes, n, m) N, derivative of z' by u_new; entry k: u_new begins to act after the fraction `NODES[k]`
+    old: Leaf  # (nodes, n, m) O, derivative of z' by u_old; entry k: u_old acts until the fraction `NODES[k]`
     command: Leaf  # (m, n) C, derivative of u by z
     direct: Leaf  # (m, k) D, derivative of u by x_seen
     disturbed: Leaf  # (n, m) E, derivative of z' by d
@@ -61,7 +61,10 @@ class Loop:
     def closed_at_sensors(
         self, xp: Any = jnp
     ) -> tuple[Float[Array | np.ndarray, "n n"], Float[Array | np.ndarray, "m n"]]:
-        """Return A (n, n) and C (m, n) with x_seen closed, in the units of the coordinates: rad, rad/s, [N m]."""
+        """Return A (n, n) and C (m, n) for x_seen equal to the first k states, so that only the input is open.
+
+        The units are rad, rad/s and N m.
+        """
         others = ((0, 0), (0, self.a.shape[0] - self.seen.shape[1]))
         return self.a + xp.pad(self.seen, others), self.command + xp.pad(self.direct, others)
 
@@ -225,8 +228,8 @@ def linearise_period(parts: Parts, nominal_period: NominalRun, *, fractional_del
 def _with_exact_length(period: Period) -> Period:
     """Return the period; a full period gets exactly the length of the clock's period [s], with its derivatives.
 
-    Without this, the length of the last full period could have a wrong derivative by delta: its sample depends on
-    delta, but its end t_end does not.
+    The last period ends at t_end. Its start depends on delta, but t_end does not. If the last period happens to be
+    full, its length would therefore have a derivative by delta, although all full periods have the same length.
     """
     now, length = period.now, period.full_length
     end = jnp.where(is_full(now, length), now.t + length, now.t_next)
@@ -382,7 +385,9 @@ class Opening(NamedTuple):
 
 
 def open_at_input(loop: Loop, extra_delay: float = 0.0, xp: Any = jnp) -> Opening:
-    """Return the loop opened at the plant's input (command [N m], B (n, m)), with an additional delay in periods.
+    """Return the loop opened at the plant's input, with an additional delay in periods.
+
+    The input of the result is the command (m,) [N m].
 
     Args:
         loop: the linearised loop.
@@ -416,9 +421,10 @@ def open_at_sensors(loop: Loop) -> Opening:
 
 
 def delay_one_axis(loop: Loop, z: Array, extra_delay: Scalar, axis: Any) -> Opening:
-    """Return the loop opened at the plant's input, B (n, m), with a delay of one axis; it is valid at only one z [-].
+    """Return the loop opened at the plant's input, with an additional delay of one axis, for one point z [-].
 
-    The loop transfer matrix is z^-`loop.delay` times the L(z) of the result.
+    Delays are factors z^-k instead of states. B (n, m) contains the factor of the additional delay, so that it is valid
+    at this z only. It does not contain the factor z^-`loop.delay`: the loop transfer matrix is this factor times L(z).
 
     Args:
         loop: the linearised loop.

@@ -60,8 +60,9 @@ def judged_times(parts: Parts) -> Float[Array, " times"]:
     """Return times to go [s] at which a loop with frozen gains is meaningful, shortest first, logarithmically spaced.
 
     The shortest is at the hand-over, where gains are largest, but at least `SHORTEST` periods. The gains then change by
-    at most a tenth from one sample to the next. The longest is the fraction `LONGEST` of t_f. There the settling time
-    of the loop equals the time to go. The times are differentiable by t_f and delta.
+    at most a tenth from one sample to the next. The longest is the fraction `LONGEST` of t_f. With the
+    prescribed-time law, the settling time of a loop with frozen gains is about 4 / (eta - 1/2) times the time to go.
+    The times are differentiable by t_f and delta.
     """
     law = parts.controller
     shortest = jnp.maximum(law.delta, SHORTEST * parts.period)
@@ -73,9 +74,9 @@ def find_period_indices(parts: Parts, run: linear.NominalRun, times: Array) -> A
     """Return the indices of the full control periods nearest to some times to go, and of one period in the hold phase.
 
     The period in the hold phase is the last period of the run. If the loop diverges, it is the last period that starts
-    with at most twice the error at the hand-over. If loops are averaged over a star tracker's interval, the interval
-    that ends there is in the hold phase, if the run is long enough. If there is no full period before the hand-over,
-    every index is the index of the period in the hold phase.
+    with at most twice the error at the hand-over. If loops are averaged over several periods, the period is late enough
+    that all of them are in the hold phase, unless the run is too short. If there is no full period before the
+    hand-over, every index is the index of the period in the hold phase.
 
     Args:
         parts: the sampled scenario.
@@ -129,7 +130,7 @@ def margins_at(parts: Parts, times_to_go: Float[Array, " times"], run: linear.No
 def judged_loops(parts: Parts, run: linear.NominalRun, *, fractional_delays: bool = True) -> tuple[Loop, Array]:
     """Return the loops at the `judged_times` and in the hold phase, and which of them are in the hold phase.
 
-    The first axis (times + 1) of the loops is the time; the last one is in the hold phase. The unit of h is [s].
+    The first axis (times + 1) of the loops is the time. The last time is in the hold phase. See `Loop` for the units.
 
     Args:
         parts: the sampled scenario.
@@ -233,7 +234,7 @@ def _run_data(parts: Parts, run: linear.NominalRun) -> tuple[Array, History, Sca
 def margins_at_ends(parts: Parts) -> dict[str, tuple[Margins, float]]:
     """Return the margins and the spectral radius at the last full period before the "hand_over" and in "hold".
 
-    If there is no full period before the hand-over, both are those of the hold phase.
+    If there is no full period before the hand-over, both results are from the hold phase.
     """
     run = linear.simulate_nominal_jit(parts)
     last_before = linear.full_periods(parts, run, hold=False)[-1:]

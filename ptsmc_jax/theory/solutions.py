@@ -367,7 +367,7 @@ def _exact_path(parts: Parts, points: int) -> tuple[Array, Array, Array]:
 def exact_peak(parts: Parts, points: int = 400) -> Scalar:
     """Return the largest input of the exact motion before the hand-over [N m].
 
-    This generalises rule 3.5 to any initial state, reference and order.
+    The initial state, the reference and the order of the system may be any.
     """
     _, u, _ = exact_path(parts, points)
     return jnp.max(jnp.abs(u))

@@ -53,7 +53,12 @@ def _to_arcsec(error: Any) -> Any:
 
 
 def _error_column(name: str, change: str) -> Value:
-    """Return the column of the pointing error under a model error that the law does not know, a key of `CHANGES`."""
+    """Return the column of the pointing error with a model error.
+
+    Args:
+        name: heading of the column.
+        change: name of the model error, a key of `CHANGES`.
+    """
     return Value(
         name,
         "arcsec",
@@ -65,7 +70,7 @@ def _error_column(name: str, change: str) -> Value:
 
 
 def _margin_columns(name: str) -> tuple[Value, Value]:
-    """Return two columns of a margin: the worst over all loops if the margin is required, and of the nominal loop."""
+    """Return two columns: the worst margin of all loops, for required margins only, and the nominal loop's margin."""
 
     def read_worst(law: Law) -> Number:
         """Return the worst margin over the dispersed loops, infinite if unlimited; None if it is not required."""
@@ -209,7 +214,7 @@ def reference_lines(question: Question, laws: list[Law]) -> dict[str, float]:
 
 
 def answer_table(question: Question, laws: dict[str, Law]) -> Table:
-    """Return the answers to a question, a law each row."""
+    """Return the answers to a question, with a row for each law."""
     columns = [value for value in question.values if any(value.read(law) is not None for law in laws.values())]
     first = columns[0]
     head = [f"{value.name} [{value.unit}]" if value.unit else value.name for value in columns]
@@ -272,7 +277,7 @@ def gain_lines(summary: Compare) -> Iterator[str]:
 
 
 def most_accurate_law(laws: dict[str, Law]) -> str:
-    """Return the most accurate law that meets every requirement, and the ratio of the paper's law to it."""
+    """Return a sentence on the most accurate law that meets every requirement, and on the error of the paper's law."""
     errors = {
         name: error for name, law in laws.items() if law.met and (error := _to_arcsec(law.window_error)) is not None
     }

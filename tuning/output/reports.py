@@ -42,7 +42,8 @@ def build(command: str, summary: Mapping[str, object], plant: str) -> Report:
 
     Args:
         command: name of the command, a key of `REPORTS`.
-        summary: the content of `summary.json`, stored or just computed; of a map the "rows" of `map.csv` with its head.
+        summary: the content of `summary.json`, from the file or just computed. For a map: {"rows": the rows of
+            `map.csv`, with its head}.
         plant: kind of the plant.
 
     Raises:
@@ -226,7 +227,7 @@ def map_lines(pairs: Sequence[Mapping[str, Any]], keys: tuple[str, str], plant: 
 
 
 def _describe_value(key: str, value: float) -> str:
-    """Return a value of a key, whose unit is in brackets, such as "loop.period = 0.1 s"."""
+    """Return key, value and unit as text, such as "loop.period = 0.1 s" for the key "loop.period [s]"."""
     name, _, unit = key.partition(" [")
     return f"{name} = {value:.4g} {unit.removesuffix(']')}".rstrip()
 

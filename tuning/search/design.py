@@ -37,11 +37,10 @@ class ShortestTime:
 
 
 def shortest_time(loaded: Scenario, requirement: Requirement, seed: int, trials: np.ndarray) -> ShortestTime:
-    """Return the shortest t_f that keeps a limit on the commanded input, with all other gains of the scenario.
+    """Return the shortest t_f that keeps a limit on the commanded input. All other gains do not change.
 
-    The number of trials that must keep the limit follows from the requirement's verdict. Theory uses the largest input
-    along the exact motion of each trial, which extends rule 3.5 to any initial state, reference and order. The search
-    by simulation begins at the t_f from theory.
+    The quantile and the confidence of the requirement determine how many trials must keep the limit. Theory uses the
+    largest input along the exact motion of each trial. The search by simulation begins at the t_f from theory.
 
     Args:
         loaded: the scenario.
@@ -74,7 +73,7 @@ def shortest_time(loaded: Scenario, requirement: Requirement, seed: int, trials:
 
         return _shortest_t_f(simulate_peak, limit, theory, max(lowest, 0.2 * theory), longest, TOLERANCE, MOST_BATCHES)
 
-    # first on the clock of the scenario, whose program is compiled anyway, and on a longer clock only if t_f is longer
+    # first on the clock of the scenario, because its program is compiled anyway; a longer t_f needs a longer clock
     shortest = search_shortest_t_f(ready, present_t_f) if theory <= present_t_f else None
     if shortest is None:
         longest = max(1.5 * theory, present_t_f)

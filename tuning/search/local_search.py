@@ -214,7 +214,7 @@ class _LocalSearch:
     def minimise_largest(self, scaled: np.ndarray, relaxed: Sequence[int] | None = None) -> np.ndarray:
         """Minimise t subject to c <= t for the limits in `relaxed`, and c <= 0 for the others. Return the last point.
 
-        None: minimise t for all limits, and return the first point that meets every limit if there is one.
+        If `relaxed` is None, minimise t for all limits, and return the first point that meets every limit, if any.
         """
         rows, trials = self.at(scaled).c.shape[1:]
         if not rows:

@@ -37,7 +37,7 @@ class Scale:
     observer_indices: tuple[int, ...] = field(metadata={"static": True})  # indices of the observer's gains
 
     def gains(self, normalised: Any) -> Any:
-        """Return the gains of normalised gains, (gains,), as a NumPy or JAX array.
+        """Convert normalised gains (gains,) to gains, as a NumPy or JAX array.
 
         Only the ratio of the bounds enters on a log scale, so the normalised gains do not depend on the units.
         """
@@ -50,7 +50,7 @@ class Scale:
         return xp.where(np.arange(len(self.log)) == k, least * (high[k] / least) ** normalised[k], gains)
 
     def least_width(self, gains: Any) -> Any:
-        """Return the lower bound of sign_width. It depends only on the observer's gains among the gains, (gains,)."""
+        """Return the lower bound of sign_width for these gains (gains,). Only the gains of the observer change it."""
         least = self.jump / gains[np.asarray(self.observer_indices)].min()
         return gains.__array_namespace__().clip(
             least, self.lower[self.width_index], MOST_OF_UPPER * self.upper[self.width_index]
@@ -81,11 +81,11 @@ class Bounds:
         return Scale(lower, upper, np.asarray(self.jump), log, width, observers)
 
     def gains(self, normalised: Any) -> Any:
-        """Return the gains of normalised gains, (gains,), see `Scale.gains`."""
+        """Convert normalised gains (gains,) to gains, see `Scale.gains`."""
         return self.scale.gains(normalised)
 
     def normalise(self, gains: np.ndarray) -> np.ndarray:
-        """Return the normalised gains of gains, (gains,). Gains beyond a bound are clipped to the bound."""
+        """Convert gains (gains,) to normalised gains. Gains beyond a bound are clipped to the bound."""
         return np.clip(self._normalise(gains), 0.0, 1.0)
 
     def with_gains(self, normalised: np.ndarray, gains: np.ndarray, which: np.ndarray) -> np.ndarray:
@@ -106,7 +106,7 @@ class Bounds:
         return combined
 
     def _normalise(self, gains: np.ndarray) -> np.ndarray:
-        """Return the normalised gains of gains, (gains,), without clipping."""
+        """Convert gains (gains,) to normalised gains, without clipping."""
         scale = self.scale
         low, high, log = scale.lower.copy(), scale.upper, np.asarray(scale.log)
         if scale.width_index is not None:
@@ -116,7 +116,11 @@ class Bounds:
         return np.where(log, logarithms / np.log(ratio), (gains - low) / (high - low))
 
     def at_bound(self, gains: np.ndarray) -> dict[str, str]:
-        """Return "lower" or "upper" by name for each gain, (gains,), that is on a bound to within `BOUND_TOLERANCE`."""
+        """Return the gains that are on a bound to within `BOUND_TOLERANCE`, as {name: "lower" or "upper"}.
+
+        Args:
+            gains: values of all free gains, (gains,).
+        """
         by_name = dict(zip(self.names, self.normalise(gains).tolist(), strict=True))
         return {name: "lower" if normalised < BOUND_TOLERANCE else "upper" for name, normalised in by_name.items()
                 if not BOUND_TOLERANCE <= normalised <= 1.0 - BOUND_TOLERANCE}  # fmt: skip

@@ -54,7 +54,7 @@ def reference_scenarios(scenario: Scenario) -> tuple[dict[str, Scenario], str | 
 def judge(scenario: Scenario, held_out_seed: int, problem: Problem | None = None, reach: Reach | None = None) -> Trials:
     """Simulate a scenario on its held-out trials, on the flight clock.
 
-    The program of the search simulates the trials if it serves the scenario, too. The results then have only the
+    If the compiled program of the search can simulate the scenario, it is used again. The results then have only the
     pointing metrics that the problem and the requirements need.
 
     Args:
@@ -93,7 +93,10 @@ def _is_served(parts: Parts, problem: Problem) -> bool:
 
 
 def _on_flight_clock(scenario: Scenario, problem: Problem | None, reach: Reach | None = None) -> Study:
-    """Return the scenario ready to simulate on the flight clock, with as many samples as the problem if possible."""
+    """Return the scenario ready to simulate on the flight clock, with at least as many samples as the problem.
+
+    With equal numbers of samples, both use one compiled program.
+    """
     simulated = study(on_flight_clock(scenario), reach=reach)
     if problem is None or not scenario.sampled:
         return simulated

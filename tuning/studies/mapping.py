@@ -93,7 +93,7 @@ def parse_axis(text: str, option: str, plant: str = "spacecraft") -> Axis:
     Args:
         text: value of the option.
         option: name of the option in error messages, "--x" or "--y".
-        plant: kind of the plant, whose keys are proposed if the key has no table.
+        plant: kind of the plant. If the text has a key without its table, the error message proposes its similar keys.
     """
     key, _, span = text.partition("=")
     parts = span.split(":")
