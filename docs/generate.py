@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
+from ptsmc_jax import units
 from ptsmc_jax.scenario import errors, keys, layouts, sensor_tables
 from ptsmc_jax.scenario.attitude_keys import Attitude
 from ptsmc_jax.scenario.tables import Limit
@@ -29,9 +30,18 @@ designed for the sampled loop. `orbit`, `flexible`, `hardware`, `sensors`, `whee
 range or is not finite is refused with its name. `ptsmc new` writes a file with all of this.
 
 Numbers are in the unit of their key. A text such as `"10 arcsec"` has a unit of its own. In a list each number may have
-its own. Allowed units are:
+its own, such as `["350 kg cm^2", "300 kg cm^2", 0.03]`:
 
-UNITS
+EXAMPLES
+
+A unit consists of symbols with powers and square roots, separated by spaces or `/`:
+
+- symbols that may have a prefix: WITH_PREFIX;
+- other symbols: WITHOUT_PREFIX;
+- prefixes: PREFIXES.
+
+`Hz` is 2 pi rad/s, but `sqrt(Hz)` is `1/sqrt(s)`. The value of a key that ends in `period` may be a frequency, such as
+`"2.5 Hz"`. The value of a `frequency` or an `orbit_rate` may be a period, such as `"95 min"`.
 
 A table with a `kind` has the keys of that kind. Commands that simulate write the complete scenario as `scenario.toml`
 beside their results. Conditions on several keys, such as `delta` of at least one control period, are reported if a
@@ -101,9 +111,12 @@ SUITE = sensor_tables.SUITE_MEANING.replace("Kalman filter", "[Kalman filter](th
 
 def scenarios() -> str:
     """Return the reference of scenario files. A kind of plant lists only the tables that earlier kinds do not have."""
-    rows = [f"| {unit} | {', '.join(others)} |" for unit, (_, *others) in catalogues.UNITS.items() if others]
-    units = "\n".join(["| unit of the key | other units |", "| --- | --- |", *rows])
-    parts = ["# Scenario files", MADE, SCENARIOS.replace("UNITS", units)]
+    rows = [f"| {unit} | {examples} |" for unit, examples in units.EXAMPLES.items()]
+    table = "\n".join(["| unit of the key | examples |", "| --- | --- |", *rows])
+    text = SCENARIOS.replace("EXAMPLES", table)
+    for name in ("WITH_PREFIX", "WITHOUT_PREFIX", "PREFIXES"):
+        text = text.replace(name, ", ".join(getattr(units, name)))
+    parts = ["# Scenario files", MADE, text]
     seen: dict[type[Table], str] = {}
     whole: dict[tuple, str] = {}  # a table with all its kinds, the default first
     for plant, title in PLANTS.items():

@@ -23,7 +23,7 @@ from ptsmc_jax.scenario.parsing import nearest_name_hint
 from ptsmc_jax.scenario.spacecraft_scenario import SpacecraftScenario
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.signals import references
-from ptsmc_jax.simulation.catalogues import UNITS
+from ptsmc_jax.units import in_si
 
 MIN_ROWS = 10  # smallest number of rows of a log
 NORM_TOLERANCE = 1e-3  # largest error of the norm of a quaternion: telemetry often has few digits
@@ -195,7 +195,7 @@ def _read_spacecraft_log(scenario: Any, table: _Table) -> Measurements:
         readings["attitude"] = _read_attitudes(config, table, columns)
     rate_columns = config.rate or _numbered_columns("measured_w", 3)
     if config.rate is not None or logged.intersection(rate_columns):
-        readings["rate"] = table.read_vectors(rate_columns, UNITS["rad/s"][config.rate_unit])
+        readings["rate"] = table.read_vectors(rate_columns, in_si(config.rate_unit))
     if not readings or all(np.isnan(values).all() for values in readings.values()):
         raise RefusedError(
             f"{table.name} has no attitude and no rate, but must have one of them; name the columns in [telemetry], "
@@ -263,7 +263,7 @@ def _read_torques_or_speeds(
 ) -> tuple[Values, bool]:
     """Return the commands (rows, channels), and `by_channel` of `Measurements`."""
     key = "wheel_torque" if config.wheel_torque is not None else "wheel_speed"
-    columns, torque_unit = getattr(config, key), UNITS["N m"][config.torque_unit]
+    columns, torque_unit = getattr(config, key), in_si(config.torque_unit)
     if columns is None:
         return table.read_commands(config.torque or _numbered_columns("sent", 3), torque_unit), False
     if scenario.wheels is None:
@@ -273,7 +273,7 @@ def _read_torques_or_speeds(
         raise RefusedError(f"telemetry.{key} has {len(columns)} columns, but must have {count}, one for each wheel")
     if key == "wheel_torque":
         return table.read_commands(columns, torque_unit), True
-    speeds = table.read_numbers(columns, UNITS["rad/s"][config.speed_unit])
+    speeds = table.read_numbers(columns, in_si(config.speed_unit))
     for k, column in enumerate(columns):
         has_speed = ~np.isnan(speeds[:, k])
         if not has_speed.any():
@@ -373,8 +373,8 @@ def _check_rates_match_attitudes(
         f"{table.name} has rates that do not fit its attitudes: the columns {', '.join(columns)} integrate to "
         f"{ratio:.3g} times the rotation"
     )
-    units = UNITS["rad/s"]
-    differences = {other: median_difference(units[other] / units[unit] * rate_turn) for other in get_args(RateUnit)}
+    ratios = {other: in_si(other) / in_si(unit) for other in get_args(RateUnit)}
+    differences = {other: median_difference(ratio * rate_turn) for other, ratio in ratios.items()}
     likely_unit = min(differences, key=lambda other: differences[other])
     if differences[likely_unit] < MAX_UNIT_DIFFERENCE:
         raise RefusedError(f'{message}; set telemetry.rate_unit = "{likely_unit}", which fits')
@@ -460,8 +460,8 @@ def _check_torques_match_motion(
     if max(1.0, abs(ratio)) * torque < MIN_TORQUE_TO_DISTURBANCE * disturbance[0]:
         return
     key, kinds = ("speed_unit", SpeedUnit) if wheel_inertia is not None else ("torque_unit", TorqueUnit)
-    units, unit = UNITS["rad/s" if wheel_inertia is not None else "N m"], getattr(config, key)
-    errors = {other: abs(np.log(abs(ratio) * units[unit] / units[other])) for other in get_args(kinds)}
+    unit = getattr(config, key)
+    errors = {other: abs(np.log(abs(ratio) * in_si(unit) / in_si(other))) for other in get_args(kinds)}
     likely_unit = min(errors, key=lambda other: errors[other])
     fits = errors[likely_unit] < np.log(UNIT_RATIO_ERROR)
     message = (

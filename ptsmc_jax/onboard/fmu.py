@@ -10,7 +10,6 @@ import re
 import sys
 import tempfile
 import zipfile
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -18,6 +17,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from ptsmc_jax import units
 from ptsmc_jax.onboard import templates
 from ptsmc_jax.onboard.expressions import REAL
 from ptsmc_jax.onboard.fields import Field
@@ -28,15 +28,6 @@ from ptsmc_jax.scenario.errors import ScenarioError
 
 VERSIONS = (2, 3)
 TYPES = {2: {"r": "Real", "i": "Integer", "u": "Integer"}, 3: {"r": "Float64", "i": "Int32", "u": "UInt32"}}
-# exponents of the base units in each unit that a description may contain
-BASE_UNITS = {
-    "rad": {"rad": 1},
-    "s": {"s": 1},
-    "m": {"m": 1},
-    "kg": {"kg": 1},
-    "N": {"kg": 1, "m": 1, "s": -2},
-    "1": {},
-}
 # parts of the state that a user may set before the first sample
 FILTER_STATE = ("attitude", "bias", "gyro", "past_attitude", "past_rate")
 
@@ -53,8 +44,8 @@ class Variable(NamedTuple):
     @property
     def unit(self) -> tuple[str, dict[str, int]]:
         """The unit in brackets in `meaning`, see `parse_unit`; an empty name if there is no or more than one unit."""
-        units = re.findall(r"\[([^\]]+)\]", self.meaning)
-        return parse_unit(units[0]) if len(units) == 1 and self.kind == "r" else ("", {})
+        found = re.findall(r"\[([^\]]+)\]", self.meaning)
+        return parse_unit(found[0]) if len(found) == 1 and self.kind == "r" else ("", {})
 
 
 class Model(NamedTuple):
@@ -77,18 +68,13 @@ class Model(NamedTuple):
 def parse_unit(text: str) -> tuple[str, dict[str, int]]:
     """Return name and exponents of the base units of a unit such as "N m/s^2", which has the name "N.m/s2".
 
-    The name is empty if the text is not a product of integer powers of known units.
+    The name is empty if the text is not a product of integer powers of rad, s, m, kg and N.
     """
-    exponents = Counter[str]()
-    for k, part in enumerate(text.split("/")):
-        for factor in part.split():
-            match = re.fullmatch(r"([A-Za-z]+|1)(?:\^(\d+))?", factor)
-            if match is None or match[1] not in BASE_UNITS:
-                return "", {}
-            for base, exponent in BASE_UNITS[match[1]].items():
-                exponents[base] += (-1 if k else 1) * exponent * int(match[2] or 1)
+    value, powers = units.parse(text) or (0, {})
+    if value != 1 or "dB" in powers or not all(power.is_integer() for power in powers.values()):
+        return "", {}
     name = "/".join(".".join(part.split()) for part in text.replace("^", "").split("/"))
-    return name, {base: power for base, power in exponents.items() if power}
+    return name, {base: int(power) for base, power in powers.items()}
 
 
 def list_variables(model: Model) -> list[Variable]:

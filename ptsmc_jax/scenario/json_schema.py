@@ -5,6 +5,7 @@ from typing import Any
 
 import msgspec
 
+from ptsmc_jax import units
 from ptsmc_jax.scenario import disturbance_tables, keys, layouts, sensor_tables
 from ptsmc_jax.scenario.custom import Custom
 from ptsmc_jax.scenario.tables import Limit, Scenario
@@ -64,7 +65,7 @@ def _table_schema(struct: type[Table], unit_of_d: str, name: str = "") -> Schema
     for key in keys.list_keys(struct, unit_of_d):
         inline = layouts.KINDS.get(f"{name}.{key.name}")
         schema = _value_schema(key.type) if inline is None else _kinds_schema("", inline, unit_of_d)
-        if key.unit in catalogues.UNITS:
+        if units.parse(key.unit) is not None:
             schema = _allow_unit_text(schema)
         if isinstance(key.default, bool | int | float | str):
             schema["default"] = key.default

@@ -4,7 +4,6 @@ This module validates single tables and keys. `checks` validates constraints bet
 """
 
 import copyreg
-import decimal
 import difflib
 import functools
 import math
@@ -13,13 +12,12 @@ import re
 import tomllib
 import typing
 from collections.abc import Iterable, Mapping
-from decimal import Decimal
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
-import numpy as np
 
+from ptsmc_jax import units
 from ptsmc_jax.scenario import (
     attitude_keys,
     custom,
@@ -40,10 +38,10 @@ from ptsmc_jax.simulation import catalogues
 DEEPEST = 8  # nesting of tables and arrays; a rotation matrix of a disturbance in a sum has depth 6
 LONGEST_KEY = 100  # largest number of characters of a key
 MOST_LISTED = 20  # largest number of known names that an error lists
+INVERTIBLE = ("period", "frequency", "orbit_rate")  # endings of keys that may be given as 1 / their quantity
 TABLES_OF_NAMES = ("telemetry", "dispersion")  # tables whose keys have the names of other things
 SUITE_TEXT = "tables with a kind, [[sensors]] for each sensor"
 _TOO_DEEP = f"but at most {DEEPEST} levels are allowed"
-_DECIMAL = decimal.Context(traps=[])  # an overflow gives infinity, which is refused later
 # a very long dotted key: the memory that the parser needs for it grows with the square of its length
 _LONG_DOTTED_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){20}""")
 
@@ -415,7 +413,7 @@ def _unknown_key_error(name: str, key: str, struct: type[Table], context: Contex
 def _parse_value(key: str, value: object, value_type: Any, unit: str = "") -> Any:
     """Return the value of a key. Texts with a unit, such as "0.05 deg", become numbers in the unit of the key."""
     try:
-        number = _to_numbers(value, catalogues.UNITS.get(unit, {}))
+        number = _to_numbers(value, unit, key)
     except TypeError:  # raised by JAX for a traced value
         raise ScenarioError(f"{key} is traced by JAX, but must be known here; with_gains takes traced gains") from None
     allowed = keys.allowed_values(value_type)
@@ -430,11 +428,12 @@ def _parse_value(key: str, value: object, value_type: Any, unit: str = "") -> An
 
 def _hint(key: str, value: object, unit: str, allowed: str) -> str:
     """Return a hint for a value that is not allowed: how its unit, a whole number or a noise per axis is written."""
-    units = catalogues.UNITS.get(unit, {})
-    entries = np.ravel(np.array(value, dtype=object))
-    if units and any(isinstance(one, str | Mapping) for one in entries):
-        return f" [{unit}], or with a unit such as {catalogues.EXAMPLES[unit]}, in {', '.join(units)}"
-    if any(_split_number(one)[1] for one in entries):
+    has_unit = units.parse(unit) is not None
+    entries = _flatten(value)
+    if has_unit and any(isinstance(one, str | Mapping) for one in entries):
+        examples = units.EXAMPLES.get(unit, f'"1 {unit}"')
+        return f" [{unit}], or with a unit such as {examples}"
+    if any(isinstance(one, str) and units.split(one)[1] for one in entries):
         return ", without a unit"
     if isinstance(value, float) and value.is_integer() and "whole number" in allowed:
         return f", written as {value:.0f}"
@@ -442,27 +441,22 @@ def _hint(key: str, value: object, unit: str, allowed: str) -> str:
         return " for all axes: the largest one, or noise_across and noise_about of a star_tracker in [[sensors]]"
     if key.removeprefix("hardware.") in device_tables.Hardware.noise_keys and isinstance(value, tuple):
         return " for all axes: the largest one, or a custom sensor in [sensors] if they differ"
-    return f" [{unit}]" if units else ""
+    return f" [{unit}]" if has_unit else ""
 
 
-def _split_number(text: Any) -> tuple[str, str]:
-    """Return the number and the unit of a text such as "0.05 deg"; both are empty for other values."""
-    joined = " ".join(text.split()) if isinstance(text, str) else ""
-    match = re.fullmatch(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?) ?(.*)", joined)
-    return (match[1], match[2]) if match else ("", "")
-
-
-def _to_numbers(value: Any, units: Mapping[str, float]) -> Any:
-    """Convert lists and NumPy arrays to tuples of Python numbers, and texts with one of these units to numbers."""
+def _to_numbers(value: Any, unit: str = "", key: str = "") -> Any:
+    """Convert lists and NumPy arrays to tuples of Python numbers, and texts with a unit to numbers in another unit."""
     if hasattr(value, "tolist"):
         value = value.tolist()
     if isinstance(value, str):
-        number, unit = _split_number(value)
-        if unit not in units:
-            return value
-        # the nearest double: 20 * 1e-6 in floating point is not 2e-5
-        return float(_DECIMAL.multiply(_DECIMAL.create_decimal(number), Decimal(str(units[unit]))))
-    return tuple(_to_numbers(one, units) for one in value) if isinstance(value, list | tuple) else value
+        number = units.convert(*units.split(value), unit, inverse=key.endswith(INVERTIBLE))
+        return value if number is None else number
+    return tuple(_to_numbers(one, unit, key) for one in value) if isinstance(value, list | tuple) else value
+
+
+def _flatten(value: Any) -> list[Any]:
+    """Return the numbers and texts of nested tuples."""
+    return [inner for one in value for inner in _flatten(one)] if isinstance(value, tuple) else [value]
 
 
 def as_written(error: ScenarioError, raw: Mapping[str, Any]) -> ScenarioError:
@@ -477,12 +471,12 @@ def as_written(error: ScenarioError, raw: Mapping[str, Any]) -> ScenarioError:
             written = written[int(name) if isinstance(written, list | tuple) else name]
     except (KeyError, IndexError, TypeError, ValueError):  # the file does not have this key
         return error
-    value, plain = _to_numbers(error.value, {}), _to_numbers(written, {})
-    for unit, units in catalogues.UNITS.items():
-        if plain != value == _to_numbers(written, units):
-            shown = brief(written)
-            if value != _to_numbers(written, dict.fromkeys(units, 1.0)):
-                shown += f" ({', '.join(f'{one:.6g}' for one in np.ravel(value))} {unit})"
+    value, plain = _to_numbers(error.value), _to_numbers(written)
+    for unit in units.EXAMPLES:
+        if plain != value == _to_numbers(written, unit, error.key):
+            shown, numbers = brief(written), _flatten(value)
+            if numbers != [float(units.split(str(one))[0]) for one in _flatten(plain)]:
+                shown += f" ({', '.join(f'{one:.6g}' for one in numbers)} {unit})"
             text = str(error).replace(brief(error.value), shown, 1)
             return ScenarioError(text, key=error.key, value=error.value, allowed=error.allowed)
     return error

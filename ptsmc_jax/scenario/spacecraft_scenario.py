@@ -122,7 +122,7 @@ class Flexible(Table, frozen=True):
         try:
             formulas.rest_inertia(formulas.check_inertia(inertia), self.coupling)
         except ValueError as error:
-            raise ScenarioError(f"flexible.coupling is {errors.brief(self.coupling)}: {error}") from None
+            raise errors.value_error("flexible.coupling", self.coupling, f": {error}") from None
 
     def check_random_modes(self, scenario: "SpacecraftScenario") -> None:
         """Raise ScenarioError if random couplings and inertias may be physically impossible.
@@ -345,7 +345,7 @@ class SpacecraftScenario(Scenario, frozen=True, kw_only=True):
                 try:
                     formulas.check_inertia(value)
                 except ValueError as error:
-                    raise ScenarioError(f"spacecraft.{key} is {errors.brief(value)}: {error}") from None
+                    raise errors.value_error(f"spacecraft.{key}", value, f": {error}") from None
 
     def check_devices(self) -> None:
         """Raise ScenarioError for modes that no body can have and for devices that contradict each other."""

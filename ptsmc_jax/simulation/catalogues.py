@@ -39,31 +39,6 @@ STATE_CATALOGUE = {name: Entry(*metric.of_states) for name, metric in METRICS.it
 ANGLE_METRICS = {"terminal_error": "terminal_angle", "window_error": "window_angle", "hold_error": "hold_angle"}
 MAY_BE_ZERO = ("saturated",)  # metrics that a requirement may limit to zero
 LARGER_IS_BETTER = tuple(f"{WITHIN}{name}" for name in TIME_FRACTION_METRICS)  # all other metrics are better if smaller
-# units that a limit may be stated in, by the unit of its metric or key: name -> value in that unit
-UNITS: dict[str, dict[str, float]] = {
-    "rad": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": math.pi / 180, "arcmin": math.pi / 10_800,
-            "arcsec": math.pi / 648_000},
-    "rad/s": {"rad/s": 1.0, "deg/s": math.pi / 180, "deg/h": math.pi / 648_000, "arcsec/s": math.pi / 648_000,
-              "rpm": math.pi / 30, "Hz": 2.0 * math.pi},
-    "rad/s/sqrt(Hz)": {"rad/s/sqrt(Hz)": 1.0, "deg/s/sqrt(Hz)": math.pi / 180, "deg/sqrt(h)": math.pi / 10_800},
-    "rad/s/sqrt(s)": {"rad/s/sqrt(s)": 1.0, "deg/s/sqrt(s)": math.pi / 180, "deg/h/sqrt(h)": math.pi / 38_880_000},
-    "N m": {"N m": 1.0, "mN m": 1e-3, "uN m": 1e-6, "Nm": 1.0, "mNm": 1e-3, "uNm": 1e-6},
-    "N m s": {"N m s": 1.0, "mN m s": 1e-3, "uN m s": 1e-6, "Nms": 1.0, "mNms": 1e-3, "uNms": 1e-6},
-    "N m/s": {"N m/s": 1.0, "mN m/s": 1e-3, "uN m/s": 1e-6, "Nm/s": 1.0, "mNm/s": 1e-3, "uNm/s": 1e-6},
-    "s": {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0},
-    "m": {"m": 1.0, "km": 1e3},
-    "kg m^2": {"kg m^2": 1.0, "kg cm^2": 1e-4, "kg mm^2": 1e-6, "g m^2": 1e-3, "g cm^2": 1e-7, "g mm^2": 1e-9},
-    "sqrt(kg) m": {"sqrt(kg) m": 1.0},
-    "deg": {"deg": 1.0, "rad": 180 / math.pi},
-    "dB": {"dB": 1.0},
-}  # fmt: skip
-# usual numbers in usual units, for error messages
-EXAMPLES = {
-    "rad": '"10 arcsec" or "0.5 deg"', "rad/s": '"0.3 deg/h" or "2 deg/s"', "rad/s/sqrt(Hz)": '"0.02 deg/sqrt(h)"',
-    "rad/s/sqrt(s)": '"0.1 deg/h/sqrt(h)"', "N m": '"5 mN m"', "N m s": '"20 mN m s"', "N m/s": '"1 mN m/s"',
-    "s": '"200 ms" or "2 min"', "m": '"500 km"', "kg m^2": '"350 kg cm^2"',
-    "sqrt(kg) m": '"0.8 sqrt(kg) m"', "deg": '"30 deg"', "dB": '"6 dB"',
-}  # fmt: skip
 CATALOGUES = {"spacecraft": CATALOGUE, "chain": STATE_CATALOGUE, "system": STATE_CATALOGUE}  # by the kind of the plant
 ANGLE_UNITS = {"spacecraft": "rad", "chain": "x1", "system": "x1"}  # unit of the column `initial_angle`
 

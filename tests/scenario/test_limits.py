@@ -2,14 +2,15 @@
 
 import math
 import re
+from collections.abc import Mapping
 
 import jax
 import numpy as np
 import pytest
 
-from ptsmc_jax import scenario
+from ptsmc_jax import scenario, units
 from ptsmc_jax.numerics.pytrees import vector
-from ptsmc_jax.scenario import parsing
+from ptsmc_jax.scenario import keys, layouts, parsing, sensor_tables
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Limit
 from ptsmc_jax.simulation import catalogues
@@ -44,15 +45,79 @@ def test_a_limit_can_be_text_with_a_unit(metric, said, value):
 
 
 def test_every_metric_unit_of_a_spacecraft_accepts_text():
-    assert {entry.unit for entry in catalogues.CATALOGUE.values()} - {"-"} <= set(catalogues.UNITS)
+    assert {entry.unit for entry in catalogues.CATALOGUE.values()} - {"-"} <= set(units.EXAMPLES)
 
 
-def test_every_unit_has_an_example_for_error_messages():
-    assert catalogues.EXAMPLES.keys() == catalogues.UNITS.keys()
-    for unit, shown in catalogues.EXAMPLES.items():
-        for number, name in re.findall(r'"(\S+) (.*?)"', shown):
-            assert float(number) > 0.0
-            assert name in catalogues.UNITS[unit]
+def test_every_unit_of_a_key_has_an_example_for_error_messages():
+    tables = [*layouts.TABLES["spacecraft"].values(), *layouts.DISPERSIONS.values(), sensor_tables.SENSORS]
+    structs = [struct for one in tables for struct in (one.values() if isinstance(one, Mapping) else [one])]
+    declared = {key.unit for struct in structs for key in keys.list_keys(struct, "N m")}
+    assert {unit for unit in declared if units.parse(unit)} <= set(units.EXAMPLES)
+    for unit, shown in units.EXAMPLES.items():
+        for example in re.findall(r'"(.*?)"', shown):
+            assert units.to_number(example, unit) > 0.0
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "value"),
+    [
+        ("800 mHz", "rad/s", 1.6 * math.pi),
+        ("15 rev/day", "rad/s", 30 * math.pi / 86_400),
+        ("3 rpm", "rad/s", math.pi / 10),
+        ("3 mdeg/s", "rad/s", np.deg2rad(3e-3)),
+        ("0.3 °/hr", "rad/s", np.deg2rad(0.3) / 3600),
+        ("50 mas", "rad", np.deg2rad(0.05 / 3600)),
+        ("50 marcsec", "rad", np.deg2rad(0.05 / 3600)),
+        ("3 µrad", "rad", 3e-6),
+        ("200 nrad", "rad", 2e-7),
+        ("2 arcmin", "rad", np.deg2rad(2 / 60)),
+        ("3 deg/h/sqrt(Hz)", "rad/s/sqrt(Hz)", np.deg2rad(3.0) / 3600),
+        ("3 arcsec/sqrt(s)", "rad/s/sqrt(Hz)", np.deg2rad(3 / 3600)),
+        ("0.02 °/√h", "rad/s/sqrt(Hz)", np.deg2rad(0.02) / 60),
+        ("2 deg/h/sqrt(s)", "rad/s/sqrt(s)", np.deg2rad(2.0) / 3600),
+        ("2 urad/s^1.5", "rad/s/sqrt(s)", 2e-6),
+        ("3 lb in^2", "kg m^2", 3 * 0.45359237 * 0.0254**2),
+        ("3 kg·m²", "kg m^2", 3.0),
+        ("4 g mm^2", "kg m^2", 4e-9),
+        ("6 mN-m", "N m", 6e-3),
+        ("6 N cm", "N m", 6e-2),
+        ("6 nN m", "N m", 6e-9),
+        ("2 mNm s", "N m s", 2e-3),
+        ("2 uNms", "N m s", 2e-6),
+        ("3 uN m/sqrt(s)", "N m/sqrt(s)", 3e-6),
+        ("0.5 1/min", "1/s", 0.5 / 60),
+        ("398600.44 km^3/s^2", "m^3/s^2", 3.9860044e14),
+        ("20 us", "s", 2e-5),
+        ("2 msec", "s", 2e-3),
+    ],
+)
+def test_units_are_products_of_symbols_with_prefixes(text, unit, value):
+    assert units.to_number(text, unit) == pytest.approx(value, rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("text", "unit"),
+    [
+        ("1 kkg m^2", "kg m^2"), ("1 mmin", "s"), ("1 mh", "s"), ("1 s-1", "1/s"), ("1 Hz", "1/s"), ("1 1/s", "rad/s"),
+        ("1 lb in", "N m"), ("1 arcsec/sqrt(Hz)", "rad"), ("1 sqrt(s", "s"), ("1 m/", "m"), ("1 x1", "x1"),
+    ],
+)  # fmt: skip
+def test_other_units_are_refused(text, unit):
+    with pytest.raises(ValueError, match="could not convert"):
+        units.to_number(text, unit)
+
+
+def test_a_period_can_be_a_frequency_and_a_frequency_a_period():
+    tracker = {"loop": SAMPLED, "hardware": {"attitude_noise": 1e-5, "star_tracker_period": "2.5 Hz"},
+               "filter": {"kind": "steady_state", "bandwidth": 0.1}}  # fmt: skip
+    assert scenario.from_tables(tracker).hardware.star_tracker_period == 0.4
+    assert scenario.from_tables({"loop": {**SAMPLED, "period": "20 Hz"}}).loop.period == 0.05
+    orbit = scenario.from_tables({"disturbance": {"kind": "gravity_gradient", "orbit_rate": "95 min"}})
+    assert orbit.disturbance.orbit_rate == pytest.approx(2.0 * math.pi / 5700.0)
+    with pytest.raises(ScenarioError, match=r'loop\.period is "0 Hz", but must be .* inf is no finite number'):
+        scenario.from_tables({"loop": {**SAMPLED, "period": "0 Hz"}})
+    with pytest.raises(ScenarioError, match=r'star_tracker_period is "2\.5 Hz" \(0\.4 s\), but without a filter'):
+        scenario.from_tables({**tracker, "filter": None})
 
 
 @pytest.mark.parametrize(

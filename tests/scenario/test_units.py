@@ -13,6 +13,7 @@ from ptsmc_jax.scenario import from_tables, keys, layouts, parsing
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.simulation import catalogues
+from ptsmc_jax.units import to_number
 from tests.tree import ROOT
 from tuning.search import gains as gain_names
 from tuning.studies import tuner
@@ -46,9 +47,7 @@ def in_units(tables: Mapping[str, Any], inertia: float, time: float) -> dict[str
         if isinstance(value, list | tuple):
             return [times(one, unit) for one in value]
         if isinstance(value, str):
-            found = re.fullmatch(r"([-+.\deE]+) (.*)", value)
-            assert found is not None
-            value = float(found[1]) * catalogues.UNITS[unit][found[2]]
+            value = to_number(value, unit)
         mass, second = powers(unit)
         return value * inertia**mass * time**second
 
