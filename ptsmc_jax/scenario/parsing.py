@@ -423,15 +423,27 @@ def _parse_value(key: str, value: object, value_type: Any, unit: str = "") -> An
     try:
         return msgspec.convert(number, value_type, strict=True)
     except msgspec.ValidationError:
-        raise wrong(key, value, allowed + _hint(key, number, unit, allowed)) from None
+        raise wrong(key, value, allowed + _hint(key, value, number, unit, value_type)) from None
 
 
-def _hint(key: str, value: object, unit: str, allowed: str) -> str:
-    """Return a hint for a value that is not allowed: how its unit, a whole number or a noise per axis is written."""
+def _hint(key: str, written: object, value: object, unit: str, value_type: Any) -> str:
+    """Return a hint for a value that is not allowed: how its unit, a whole number or a noise per axis is written.
+
+    Args:
+        key: the key.
+        written: its value as the file gives it.
+        value: the same value, with numbers instead of texts with a valid unit.
+        unit: unit of the key.
+        value_type: type of the key.
+    """
+    allowed, depth = keys.allowed_values(value_type), _list_depth(value_type)
     has_unit = units.parse(unit) is not None
     entries = _flatten(value)
-    if has_unit and any(isinstance(one, str | Mapping) for one in entries):
+    if has_unit and (any(isinstance(one, str | Mapping) for one in entries) or (depth and isinstance(written, str))):
         examples = units.EXAMPLES.get(unit, f'"1 {unit}"')
+        if depth:  # the text itself if its unit fits, or one example, in the brackets of a list
+            example = show(written) if isinstance(value, float) else re.split(", | or ", examples)[0]
+            examples = f"{'[' * depth}{example}, ..{']' * depth}"
         return f" [{unit}], or with a unit such as {examples}"
     if any(isinstance(one, str) and units.split(one)[1] for one in entries):
         return ", without a unit"
@@ -442,6 +454,12 @@ def _hint(key: str, value: object, unit: str, allowed: str) -> str:
     if key.removeprefix("hardware.") in device_tables.Hardware.noise_keys and isinstance(value, tuple):
         return " for all axes: the largest one, or a custom sensor in [sensors] if they differ"
     return f" [{unit}]" if has_unit else ""
+
+
+def _list_depth(value_type: Any) -> int:
+    """Return 0 for the type of a number, 1 for a list of numbers, and 2 for a list of rows."""
+    inner = typing.get_args(value_type)
+    return (typing.get_origin(value_type) is tuple) + (_list_depth(inner[0]) if inner else 0)
 
 
 def _to_numbers(value: Any, unit: str = "", key: str = "") -> Any:
