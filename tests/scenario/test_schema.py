@@ -284,6 +284,7 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path, content, said):
             "mode =\tsampled  # at 20 Hz",
             "(at line 1, column 8): mode = sampled # at 20 Hz; a text needs quotes, also a number ",
         ),
+        ("inertia = [350 kg cm^2, 300, 320]", "inertia = [350 kg cm^2, 300, 320]; a text needs quotes"),
         ("[loop]\nt_end = 60,0\n", "(at line 2, column 11): t_end = 60,0"),
     ],
 )
