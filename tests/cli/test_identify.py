@@ -79,7 +79,8 @@ def test_a_doubtful_result_names_dispersed_parameters_that_are_not_free(command,
 
 
 def test_a_design_has_a_profile_within_the_limits(command, logged):
-    status, out, err = command("identify", "s.toml", "--design", "--duration", 6, "--rate", 0.5, "--out", "plan")
+    options = "--design", "--duration", "0.1 min", "--rate", "500 mrad/s"
+    status, out, err = command("identify", "s.toml", *options, "--out", "plan")
     assert status == 0, err
     assert out.startswith("Proposed a manoeuvre of 6 s")
     profile = pl.read_csv(logged / "plan" / "profile.csv").to_dict(as_series=False)
@@ -107,6 +108,7 @@ def test_a_design_names_parameters_that_are_known_better_than_the_manoeuvre_can_
         ([], "give at least one log file after the scenario, or --design"),
         (["run/trajectory.csv", "--design"], "--design needs no log: leave the log files out"),
         (["run/trajectory.csv", "--rate", "0.1"], "--rate is 0.1, but must be absent without --design"),
+        (["--design", "--rate", "2 m/s"], "for --rate: 2 m/s is no number in rad/s or with a unit such as"),
         (["absent.csv"], "the log is absent.csv, which does not exist; allowed is a .csv or .parquet file"),
         (["s.toml"], "the log is s.toml, but must be a .csv or .parquet file"),
     ],

@@ -49,7 +49,8 @@ def few_together():
 
 
 def asked(x, y, text=SHORT):
-    return scenario.from_tables(tomllib.loads(text)), mapping.parse_axis(x, "--x"), mapping.parse_axis(y, "--y")
+    loaded = scenario.from_tables(tomllib.loads(text))
+    return loaded, mapping.parse_axis(x, "--x", loaded), mapping.parse_axis(y, "--y", loaded)
 
 
 def simulated(x, y, text=SHORT, trials=6):
@@ -68,8 +69,8 @@ def simulated(x, y, text=SHORT, trials=6):
 def test_the_default_axes_follow_the_period_and_t_f_of_the_scenario(controller, period, ends):
     made = scenario.from_tables({"controller": controller, "loop": {"mode": "sampled", "period": period}})
     axes = (
-        mapping.parse_axis(mapping.default_period_axis(made), "--x"),
-        mapping.parse_axis(mapping.default_gain_axis(made), "--y"),
+        mapping.parse_axis(mapping.default_period_axis(made), "--x", made),
+        mapping.parse_axis(mapping.default_gain_axis(made), "--y", made),
     )
     assert [axis.key for axis in axes] == ["loop.period", "controller.delta"]
     assert [(axis.values[0], axis.values[-1]) for axis in axes] == ends
@@ -79,7 +80,7 @@ def test_the_default_axes_follow_the_period_and_t_f_of_the_scenario(controller, 
 def test_the_default_y_axis_of_a_law_without_delta_is_its_first_gain():
     law = {"kind": "time_base_sliding", "t_f": 35.0}
     made = scenario.from_tables({"controller": law, "loop": {"mode": "sampled"}, "observer": {"kind": "none"}})
-    axis = mapping.parse_axis(mapping.default_gain_axis(made), "--y")
+    axis = mapping.parse_axis(mapping.default_gain_axis(made), "--y", made)
     assert axis.key == "controller.surface_rate"
     bounds = scenario.replace(made, tune={}).search.bounds["surface_rate"]
     np.testing.assert_allclose((axis.values[0], axis.values[-1]), bounds, rtol=1e-3)
@@ -96,12 +97,16 @@ def test_the_default_y_axis_of_a_law_without_delta_is_its_first_gain():
         ("hardware.delay=0.6:8.4:9", [1.0, 2.0, 3.0, 4.0, 6.0, 8.0]),
         ("controller.delta=0.05:5:9", np.geomspace(0.05, 5.0, 9)),
         ("loop.t_end=100:100.001:5", [100.0, 100.001]),
+        ("loop.period=100ms:0.4 s:3", [0.1, 0.25, 0.4]),
+        ("hardware.attitude_noise=10arcsec:20arcsec:2", np.deg2rad([10 / 3600, 20 / 3600])),
+        ("observer.gain[0]=20mNms:40mNms:2", [0.02, 0.04]),
     ],
 )
 def test_axes(text, values):
     """Earlier, the text of an axis was 1:6:4 for delays of 1, 2, 4 and 6 periods, but it gives other delays."""
-    axis = mapping.parse_axis(text, "--x")
-    assert mapping.parse_axis(axis.text, "--x").values == axis.values
+    made = scenario.from_tables({})
+    axis = mapping.parse_axis(text, "--x", made)
+    assert mapping.parse_axis(axis.text, "--x", made).values == axis.values
     np.testing.assert_allclose(axis.values, values, rtol=5e-6)  # six digits
 
 
@@ -127,7 +132,12 @@ def test_axes_have_the_units_of_their_keys():
 )  # fmt: skip
 def test_invalid_axes_are_refused(text):
     with pytest.raises(UsageError, match=r"--y is .*KEY=LOW:HIGH:COUNT"):
-        mapping.parse_axis(text, "--y")
+        mapping.parse_axis(text, "--y", scenario.from_tables({}))
+
+
+def test_the_refusal_of_a_range_has_the_unit_of_its_key():
+    with pytest.raises(UsageError, match='in s or with a unit such as "200 ms"'):
+        mapping.parse_axis("loop.period=1m:2m:3", "--x", scenario.from_tables({}))
 
 
 @pytest.mark.parametrize(("plant", "key", "nearest"), [
@@ -136,7 +146,7 @@ def test_invalid_axes_are_refused(text):
 ])  # fmt: skip
 def test_the_refusal_of_a_key_without_its_table_names_the_nearest_keys(plant, key, nearest):
     with pytest.raises(UsageError, match=re.escape(nearest)):
-        mapping.parse_axis(f"{key}=1:2:3", "--x", plant)
+        mapping.parse_axis(f"{key}=1:2:3", "--x", scenario.from_tables({"plant": {"kind": plant}}))
 
 
 @pytest.fixture(scope="module")
@@ -254,8 +264,8 @@ def test_an_inertia_is_not_replaced_by_a_number(inertia, key, refused):
     loaded = scenario.from_tables({"spacecraft": {"inertia": inertia}})
     with pytest.raises(ScenarioError, match=re.escape(refused)):
         mapping.simulate(
-            loaded, mapping.parse_axis(f"{key}=9:11:2", "--x"), mapping.parse_axis("controller.eta=3:4:2", "--y"),
-            0, 1, lambda done, total: None,
+            loaded, mapping.parse_axis(f"{key}=9:11:2", "--x", loaded),
+            mapping.parse_axis("controller.eta=3:4:2", "--y", loaded), 0, 1, lambda done, total: None,
         )  # fmt: skip
 
 
@@ -305,7 +315,7 @@ def test_stability_limits_are_drawn_over_period_and_delta_only():
     )
     delta, period = lines["stability limit with a period of delay"]
     assert np.all(delta < mapping.stability_limit_formulas(loaded, x, y)["stability limit with a period of delay"][0])
-    assert not mapping.stability_limit_formulas(loaded, x, mapping.parse_axis("controller.eta=3:4:2", "--y"))
+    assert not mapping.stability_limit_formulas(loaded, x, mapping.parse_axis("controller.eta=3:4:2", "--y", loaded))
     third = scenario.from_tables({"plant": {"kind": "chain", "order": 3}, "loop": {"mode": "sampled"}})
     assert not mapping.stability_limit_formulas(third, x, y)  # the formula is for plants of order 2
     # earlier, the formula was drawn for a loop with a lag or a filter, which it ignores

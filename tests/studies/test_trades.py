@@ -88,7 +88,7 @@ def test_larger_margins_reduce_the_accuracy(command, tmp_path, monkeypatch):
         ),
         *(
             (("--against", "t_f", "--times", times), f"--times is {times}, but must be two times or more in s")
-            for times in ("4", "4,x", "4,4", "0,3", "3,inf", "")
+            for times in ("4", "4,x", "4,4", "60,1min", "4m,8m", "0,3", "3,inf", "")
         ),
         (
             ("--against", "t_f", "--times", "0.2,5"),
@@ -199,7 +199,7 @@ def test_faster_slew_needs_more_torque_and_is_less_accurate(command, tmp_path, m
     assert f"{met} of 2 points meet every requirement" in page.text
     assert "--against t_f --times 2.5,5" in page.text
     assert (tmp_path / "cost" / "figures" / "slew_times.png").exists()
-    again = command("pareto", "c.toml", "--against", "t_f", "--times", "5,2.5", "--out", "cost")
+    again = command("pareto", "c.toml", "--against", "t_f", "--times", "5,2500ms", "--out", "cost")
     assert "from an earlier run" in again[1]
 
 

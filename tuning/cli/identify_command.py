@@ -4,13 +4,10 @@ from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
-from cyclopts.validators import Number
 
-from tuning.cli.options import USUAL, Common, Out, prepare
+from tuning.cli.options import USUAL, Common, Out, positive, prepare
 from tuning.errors import UsageError
 from tuning.output import progress, terminal
-
-Positive = Annotated[float | None, Parameter(validator=Number(gt=0))]
 
 
 def identify(
@@ -18,9 +15,9 @@ def identify(
     *logs: Annotated[Path, Parameter(name="LOG", help="Telemetry, .csv or .parquet; [telemetry] maps its columns.")],
     validate: tuple[Path, ...] = (),
     design: bool = False,
-    duration: Positive = None,
-    rate: Positive = None,
-    torque: Positive = None,
+    duration: Annotated[float | None, positive("s")] = None,
+    rate: Annotated[float | None, positive("rad/s")] = None,
+    torque: Annotated[float | None, positive("N m")] = None,
     out: Out = None,
     common: Common = USUAL,
 ) -> int:
@@ -34,9 +31,9 @@ def identify(
     Args:
         validate: Log that is predicted only, to check the model; several times.
         design: Propose a torque profile that determines the parameters; without logs.
-        duration: Duration of the profile [s]; default: 300.
-        rate: Largest rate in the profile [rad/s]; default: 0.05.
-        torque: Largest torque [N m]; default: of the actuators.
+        duration: Duration of the profile in s or with a unit; default: 300.
+        rate: Largest rate in the profile in rad/s or with a unit, such as "2 deg/s"; default: 0.05.
+        torque: Largest torque in N m or with a unit; default: of the actuators.
     """
     if design == bool(logs):
         raise UsageError(

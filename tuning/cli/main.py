@@ -118,7 +118,13 @@ def map_(
     scenario: SampledFile = None,
     /,
     *,
-    x: str | None = None,
+    x: Annotated[
+        str | None,
+        Parameter(
+            help="KEY=LOW:HIGH:COUNT, with numbers in the unit of the key or with a unit, such as "
+            "loop.period=20ms:0.2s:9; KEY[0] for one number of a list; default: loop.period, 0.4 to 10 times its value."
+        ),
+    ] = None,
     y: str | None = None,
     trials: Annotated[int, whole_number(1, 1_000_000)] = 32,
     out: Out = None,
@@ -131,7 +137,6 @@ def map_(
     Exit status: 0 done, 2 configuration error. A pair that is not allowed or fails is marked, not dropped.
 
     Args:
-        x: KEY=LOW:HIGH:COUNT, KEY[0] for one number of a list; default: loop.period, 0.4 to 10 times its value.
         y: KEY=LOW:HIGH:COUNT; default: delta from a period to t_f / 7, or the law's first gain.
         trials: Trials of each pair, 1 to 1000000.
     """
@@ -139,8 +144,8 @@ def map_(
     from ptsmc_jax.campaigns import store
     from tuning.studies import mapping
 
-    x_axis = mapping.parse_axis(x or mapping.default_period_axis(loaded), "--x", loaded.plant.kind)
-    y_axis = mapping.parse_axis(y or mapping.default_gain_axis(loaded), "--y", loaded.plant.kind)
+    x_axis = mapping.parse_axis(x or mapping.default_period_axis(loaded), "--x", loaded)
+    y_axis = mapping.parse_axis(y or mapping.default_gain_axis(loaded), "--y", loaded)
     if x_axis.key == y_axis.key:
         raise UsageError(f"--y is {y_axis.text}, but must be another key than --x")
     with store.lock_folder(folder, force=common.force):
@@ -253,7 +258,7 @@ def pareto(
     Args:
         against: Quantity that the accuracy is traded against.
         points: Number of torque limits, each with its own tuned gains, 3 to 100; default: 20.
-        times: Prescribed times to tune for, with --against t_f [s], such as 20,30. Default: t_f / 2 to 2 t_f.
+        times: Prescribed times to tune for, with --against t_f, such as 20,30 or 20s,1min; default: t_f / 2 to 2 t_f.
     """
     values = parse_traded_values(against, points, times, limits)
     loaded, folder = prepare(scenario, "pareto", out, device, trust=common.trust)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter, Token
 from cyclopts.validators import Number
 
+from ptsmc_jax import units
 from tuning.errors import UsageError
 
 if TYPE_CHECKING:
@@ -26,6 +27,19 @@ def _parse_integer(_: object, tokens: Sequence[Token]) -> int:
 def whole_number(minimum: int = 0, maximum: int = 2**32 - 1, **others: Any) -> Parameter:
     """Return an option that is a whole number in a range; others: see `Parameter`."""
     return Parameter(converter=_parse_integer, validator=Number(gte=minimum, lte=maximum), **others)
+
+
+def positive(unit: str) -> Parameter:
+    """Return an option that is a number greater than 0 in a unit, or with another unit such as "2 deg/s"."""
+
+    def parse(_: object, tokens: Sequence[Token]) -> float:
+        text = tokens[0].value
+        try:
+            return units.to_number(text, unit)
+        except ValueError:
+            raise ValueError(f"{text} is no number in {unit} or with a unit such as {units.EXAMPLES[unit]}") from None
+
+    return Parameter(converter=parse, validator=Number(gt=0))
 
 
 ScenarioFile = Annotated[Path | None, Parameter(help="Scenario file (TOML); default: the paper's Case I.")]
@@ -80,11 +94,11 @@ def how_to_resume(force: bool) -> str:
     return f"the same command{' without --force' if force else ''} resumes it"
 
 
-# option for the values of each quantity, their smallest number, and the allowed values
+# option for the values of each quantity, their unit, their smallest number, and the allowed values
 VALUES = {
-    "torque": ("--points", 1, ""),
-    "t_f": ("--times", 2, "two times or more in s, all different, such as 20,30,45"),
-    "margins": ("--limits", 1, "limits in dB, greater than 0 and all different, such as 4,6,9"),
+    "torque": ("--points", "", 1, ""),
+    "t_f": ("--times", "s", 2, "two times or more in s or with a unit, all different, such as 20,30,45 or 20s,1min"),
+    "margins": ("--limits", "dB", 1, "limits in dB, greater than 0 and all different, such as 4,6,9"),
 }
 
 
@@ -104,12 +118,12 @@ def parse_traded_values(against: str, points: int | None, times: str | None, lim
         UsageError: an option does not belong to this quantity, or its values are not allowed.
     """
     numbers: tuple[float, ...] = ()
-    for (kind, (option, fewest, allowed)), value in zip(VALUES.items(), (points, times, limits), strict=True):
+    for (kind, (option, unit, fewest, allowed)), value in zip(VALUES.items(), (points, times, limits), strict=True):
         if value is not None and against != kind:
             raise UsageError(f"{option} is {value}, but must be absent without --against {kind}")
         if isinstance(value, str):
             with contextlib.suppress(ValueError):
-                numbers = tuple(sorted(float(part) for part in value.split(",")))
+                numbers = tuple(sorted(units.to_number(part, unit) for part in value.split(",")))
             valid = all(0.0 < number < float("inf") for number in numbers)
             if len(numbers) < fewest or len(set(numbers)) < len(numbers) or not valid:
                 raise UsageError(f"{option} is {value}, but must be {allowed}")

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from contourpy import contour_generator
 
+from ptsmc_jax import units
 from ptsmc_jax.campaigns import margin_verdicts, montecarlo, store
 from ptsmc_jax.figures import study_plots, style
 from ptsmc_jax.scenario import Study, custom, errors, keys, parsing, study, tables
@@ -84,27 +85,31 @@ class Map:
         return np.array([getattr(cell, name) for cell in self.cells]).reshape(len(self.y.values), len(self.x.values))
 
 
-def parse_axis(text: str, option: str, plant: str = "spacecraft") -> Axis:
+def parse_axis(text: str, option: str, scenario: Scenario) -> Axis:
     """Parse an axis from KEY=LOW:HIGH:COUNT, such as controller.delta=0.05:3:9.
 
     The values have equal ratios if HIGH exceeds `LOGARITHMIC_SPAN` times LOW, otherwise equal differences. KEY[0]
-    selects one element of a key with several numbers. Raises UsageError if the text is invalid.
+    selects one element of a key with several numbers. LOW and HIGH are in the unit of the key, or have another unit.
+    Raises UsageError if the text is invalid.
 
     Args:
         text: value of the option.
         option: name of the option in error messages, "--x" or "--y".
-        plant: kind of the plant. If the text has a key without its table, the error message proposes its similar keys.
+        scenario: the scenario of the map, which has the units of the keys.
     """
     key, _, span = text.partition("=")
     parts = span.split(":")
     examples = "controller.delta=0.05:3:9 or observer.gain[0]=5:10:3"
     message = f"{option} is {text}, but must be KEY=LOW:HIGH:COUNT, such as {examples}"
     if re.fullmatch(r"\w+", key):
-        message += f"; {parsing.nearest_keys_hint(key, plant)}"
+        message += f"; {parsing.nearest_keys_hint(key, scenario.plant.kind)}"
     if len(parts) != 3 or not re.fullmatch(r"\w+\.\w+(\[\d+\])?", key):
         raise UsageError(message)
+    unit = unit_of(scenario, key)
+    if unit in units.EXAMPLES:
+        message += f", with numbers in {unit} or with a unit such as {units.EXAMPLES[unit]}"
     try:
-        low, high, count = float(parts[0]), float(parts[1]), int(parts[2])
+        low, high, count = units.to_number(parts[0], unit), units.to_number(parts[1], unit), int(parts[2])
     except ValueError:
         raise UsageError(message) from None
     if not (np.isfinite(low) and np.isfinite(high) and low < high and 2 <= count <= 100):
@@ -352,12 +357,18 @@ def _radii(scenario: Scenario) -> dict[str, str]:
 
 
 def label_with_unit(scenario: Scenario, key: str) -> str:
-    """Return a key with its unit from the schema of its table; without a unit if the scenario has no such table."""
-    table, _, name = key.partition(".")
-    declared = getattr(scenario, table, None)
-    known_keys = () if declared is None else keys.list_keys(type(declared), scenario.unit_of_d)
-    unit = next((entry.unit for entry in known_keys if entry.name == name.partition("[")[0]), "")
+    """Return a key with its unit in brackets, if it has one."""
+    unit = unit_of(scenario, key)
     return f"{key} [{unit}]" if unit else key
+
+
+def unit_of(scenario: Scenario, key: str) -> str:
+    """Return the unit of a key; empty if it has none, or if it is in a table whose kind the scenario does not state."""
+    table, _, name = key.partition(".")
+    declared, kinds = getattr(scenario, table, None), scenario.TABLES.get(table)
+    struct = type(declared) if declared is not None else kinds
+    known_keys = keys.list_keys(struct, scenario.unit_of_d) if isinstance(struct, type) else ()
+    return next((entry.unit for entry in known_keys if entry.name == name.partition("[")[0]), "")
 
 
 def write(folder: Path, simulated: Map, seed: int, figures: bool) -> None:
