@@ -13,13 +13,14 @@ import shlex
 import shutil
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
 import tomli_w
 
-from ptsmc_jax import provenance
+from ptsmc_jax import provenance, units
 from ptsmc_jax.scenario import parsing
 
 try:
@@ -392,11 +393,23 @@ def write_run_files(folder: Path, scenario: Tables, made_by: Tables, summary: Ta
 
 
 def write_toml(path: Path, tables: Tables) -> None:
-    """Write a TOML file, with arrays on one line."""
+    """Write a TOML file, with arrays on one line. The units of the keys of a complete scenario are comments."""
     text, before = tomli_w.dumps(_name_objects(tables)), ""
     while text != before:  # the innermost arrays are joined first
         text, before = re.sub(r"\[\n((?: +[^\]\s][^\n]*,\n)+) *\]", _join_array, text), text
-    write_text(path, text)
+    write_text(path, _add_units(text, tables) if "plant" in tables else text)
+
+
+def _add_units(text: str, tables: Tables) -> str:
+    """Return the text of a scenario file with units; tables: its tables, see `parsing.dump`."""
+    lines, known, count = list[str](), dict[str, str](), Counter[str]()
+    for line in text.split("\n"):
+        if header := re.fullmatch(r"\[+([\w.]+)\]+", line):
+            known = parsing.units_of_keys(tables, header[1], count[header[1]])
+            count[header[1]] += 1
+        unit = known.get(line.partition(" = ")[0])
+        lines.append(f"{line}  # {unit}" if unit in units.EXAMPLES else line)
+    return "\n".join(lines)
 
 
 def write_json(path: Path, value: object) -> None:

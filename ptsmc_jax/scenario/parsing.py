@@ -236,6 +236,30 @@ def stated_tables(scenario: Scenario) -> dict[str, Any]:
     return tables
 
 
+def units_of_keys(tables: Mapping[str, Any], name: str, index: int = 0) -> dict[str, str]:
+    """Return the units of the keys of a table, by key.
+
+    Args:
+        tables: tables of a file, see `dump`.
+        name: name of the table, such as dispersion.rate.
+        index: number of the table in a list of tables.
+    """
+    scenario_class = SCENARIOS[tables["plant"]["kind"]]
+    table: Any = tables
+    for part in name.split("."):
+        table = table[part]
+    outer, _, inner = name.partition(".")
+    if outer == "requirements":
+        metrics = {**scenario_class.metrics, **catalogues.MARGINS}
+        return {"limit": metrics[inner].unit} if inner else {key: entry.unit for key, entry in metrics.items()}
+    struct: Any = layouts.KINDS.get(name, scenario_class.TABLES[outer])
+    if isinstance(table, list):
+        struct, table = sensor_tables.SENSORS if outer == "sensors" else struct, table[index]
+    if isinstance(struct, Mapping):
+        struct = struct[table.get("kind", next(iter(struct)))]
+    return {key.name: key.unit for key in keys.list_keys(struct, scenario_class.unit_of_d)}
+
+
 def unstated_values(raw: Mapping[str, object], tables: Mapping[str, object]) -> dict[tuple[str, ...], object]:
     """Return the values of keys in `tables` that `raw` does not have, by the path of the key."""
     missing: dict[tuple[str, ...], object] = {}

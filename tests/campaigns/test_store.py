@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ptsmc_jax.campaigns import store
+from ptsmc_jax.scenario import from_tables, parsing, read
 from tests.helpers import tree
 
 
@@ -284,6 +285,29 @@ def test_toml_tables_are_read_back_exactly(tmp_path_factory, tables):
     read = tomllib.loads(path.read_text(encoding="utf-8"))
     # compared as text, which distinguishes 1, 1.0 and true
     assert json.dumps(read, sort_keys=True) == json.dumps(tables, sort_keys=True)
+
+
+def test_a_scenario_file_has_the_unit_of_each_number(tmp_path):
+    tracker = {"kind": "star_tracker", "noise_across": "8 arcsec", "noise_about": "40 arcsec"}
+    raw = {
+        "disturbance": {"kind": "sum", "terms": [{"kind": "constant"}, {"kind": "random_walk"}]},
+        "observer": {"kind": "finite_time"},
+        "loop": {"mode": "sampled"},
+        "sensors": [tracker, {"kind": "gyro", "rate_noise_density": "0.1 deg/sqrt(h)"}],
+        "dispersion": {"rate": {"kind": "normal", "std": "1 deg/s"}},
+        "requirements": {"hold_angle": "0.5 deg", "peak_torque": {"limit": "0.5 N m", "quantile": 0.9}},
+        "tune": {},
+    }
+    made = from_tables(raw)
+    store.write_toml(tmp_path / "s.toml", parsing.dump(made))
+    lines = (tmp_path / "s.toml").read_text().splitlines()
+    shown = [line for line in lines if line.startswith(("gain ", "density", "rate_noise", "std", "limit", "inertia"))]
+    assert [line.partition("  # ")[2] for line in shown] == [
+        "kg m^2", "N m/sqrt(s)", "N m/s", "rad/s/sqrt(Hz)", "rad/s", "N m",
+    ]  # fmt: skip
+    assert "eta = 3.0" in lines
+    assert next(line for line in lines if line.startswith("hold_angle")).endswith("  # rad")
+    assert read(tmp_path / "s.toml") == made
 
 
 def finished(folder, tables):
