@@ -62,13 +62,16 @@ tables below.
 | another metric is infinite or has no value | it counts as diverged at t_end |
 | it is `not_converged`: at t_f it is far from the reference | its metrics count |
 
-`verdicts` in `summary.json` has an entry for each requirement:
+`verdicts` in `summary.json` is a list with an entry for each requirement:
 
 | key | unit | meaning |
 | --- | --- | --- |
+| `metric` | - | name of the metric or margin |
 | `limit` | the metric's | largest allowed value; smallest allowed value if `at_least` is true |
 | `worst` | the metric's | largest value of all trials; smallest value if `at_least` is true |
 | `margin` | - | `worst` / `limit`, or 2 - `worst` / `limit` if `at_least` is true; never negative |
+| `failures` | - | number of trials beyond the limit or without a value |
+| `trials` | - | number of judged trials; for a margin, number of judged loops |
 | `met` | - | whether the requirement is met |
 
 The requirement is met if `margin` is at most 1. A `margin` of 1.1 is 10 % beyond the limit. With a quantile, `margin`

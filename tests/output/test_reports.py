@@ -396,7 +396,7 @@ def most_accurate_law(pd_error: float) -> str:
 
 
 def run(lower_bound: float | None) -> Report:
-    told = {"status": "ok", "reason": "", "bad_time": None, "window_error": 1e-5, "verdicts": {}, "warnings": []}
+    told = {"status": "ok", "reason": "", "bad_time": None, "window_error": 1e-5, "verdicts": [], "warnings": []}
     angles = {"window_angle": 2e-5, "hold_angle": 0.02, "peak_rate": 0.02}  # in arcsec, in deg, and no angle
     return reports.build("simulate", {**told, **angles, "lower_bound": lower_bound}, "spacecraft")
 

@@ -241,7 +241,7 @@ def _charts(result: Result) -> dict[str, list[Block]]:
     command = result.versions["command"]
     if command == "simulate":
         with reports.name_in_errors(result.source):
-            trial = reports.drawn_table(summaries.run(result.summary, result.plant))
+            trial = reports.drawn_table(summaries.run(result.summary))
         charts: dict[str, list[Block]] = {"History": _history_charts(result)}
         return {**charts, "Trial": [trial]} if trial.rows else charts
     if command == "tune":

@@ -251,7 +251,7 @@ def _map_column(name: str, *cells: str, plant: str) -> tuple[str, ...]:
 
 
 REPORTS: dict[str, Callable[[Mapping[str, Any], str], Report]] = {
-    "simulate": lambda summary, plant: run_report(summaries.run(summary, plant), plant),
+    "simulate": lambda summary, plant: run_report(summaries.run(summary), plant),
     "tune": lambda summary, _: tune_report.build(summaries.tune(summary)),
     "pareto": lambda summary, _: front_report.build(front.read(summary)),
     "compare": lambda summary, _: compare_report.build(summaries.read(summaries.Compare, summary)),

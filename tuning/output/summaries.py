@@ -225,14 +225,9 @@ def read(kind: type[T], summary: Mapping[str, object]) -> T:
     return msgspec.convert(store.to_json_value(summary), kind)
 
 
-def run(summary: Mapping[str, Any], plant: str) -> Run:
-    """Return the summary of one run of this kind of plant; see `read`."""
-    units = {**CATALOGUES[plant], **MARGINS}
-    verdicts = [
-        {**entry, "metric": name, "unit": units[name].unit, "trials": 1, "failures": int(not entry["met"])}
-        for name, entry in summary["verdicts"].items()
-    ]
-    return read(Run, {**_collect_metrics(summary), "verdicts": verdicts})
+def run(summary: Mapping[str, Any]) -> Run:
+    """Return the summary of one run; see `read`."""
+    return read(Run, _collect_metrics(summary))
 
 
 def tune(summary: Mapping[str, Any]) -> Tune:

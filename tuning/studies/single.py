@@ -21,9 +21,6 @@ from ptsmc_jax.scenario.tables import Scenario
 if TYPE_CHECKING:  # runs without C code do not need this import
     from ptsmc_jax.onboard.library import InTheLoop
 
-# fields of a verdict on a requirement that allows violations for some of the time
-TIME_FRACTION_FIELDS = ("quantile", "confidence", "interpretation", "fraction_of_time", "shown")
-
 
 def summary(run: Run, scenario: Scenario, computer: "InTheLoop | None" = None) -> dict[str, object]:
     """Return the content of `summary.json`.
@@ -33,13 +30,7 @@ def summary(run: Run, scenario: Scenario, computer: "InTheLoop | None" = None) -
         scenario: scenario of the run.
         computer: the C code that controlled the run; None: the simulated law did.
     """
-    verdicts = {
-        v.metric: {
-            **{"limit": v.limit, "margin": v.margin, "met": v.met, "worst": v.worst, "at_least": v.at_least},
-            **({} if v.fraction_of_time is None else {name: getattr(v, name) for name in TIME_FRACTION_FIELDS}),
-        }
-        for v in run.verdicts
-    }
+    verdicts = [verdict.in_summary() for verdict in run.verdicts]
     heading = {"status": run.status, "reason": run.reason, "bad_time": run.bad_time}
     lower_bound = None if run.lower_bound is None else run.lower_bound.window_error
     warnings, controller_entries = plausibility.warnings(scenario), {}
