@@ -79,21 +79,28 @@ def _limit_beyond_actuators(scenario: Scenario) -> Iterator[str]:
 
 
 def _disturbance_beyond_actuators(scenario: Scenario) -> Iterator[str]:
-    """Warn if the constant part of the disturbance of a spacecraft is larger than the torque limits of the actuators.
+    """Warn if constants and sinusoids that disturb a spacecraft exceed the torque limits of the actuators together.
 
-    Periodic parts are not examined: their torques may be larger, at frequencies that no actuator follows.
+    Sinusoids from the Nyquist frequency on are not counted: vibration may be larger, and no actuator follows it.
     """
     if scenario.motion != "spacecraft":
         return
-    keys, terms = {"constant": "amplitude", "sinusoid": "bias"}, scenario.terms_by_place.values()
-    parts = [getattr(term, keys[term.kind]) for term in terms if term.kind in keys]
-    constant = np.sum(parts, axis=0) if parts else np.zeros(3)
+    constant, periodic = np.zeros(3), np.zeros(3)
+    for term in scenario.terms_by_place.values():
+        if term.kind == "constant":
+            constant += term.amplitude
+        elif term.kind == "sinusoid":
+            is_slow = np.abs(term.frequency) * scenario.loop.period < np.pi
+            constant += term.bias
+            periodic += np.where(is_slow, np.abs(term.amplitude), 0.0)
     for key, limit, axes in _torque_limits(scenario):
-        needed = float(np.max(np.abs(np.linalg.pinv(axes) @ constant)))
+        to_actuators = np.linalg.pinv(axes)
+        needed = float(np.max(np.abs(to_actuators @ constant) + np.abs(to_actuators) @ periodic))
         if needed > limit:
             each = "of a wheel" if key == "wheels.torque_limit" else "about an axis"
+            largest = errors.brief((np.abs(constant) + periodic).tolist())
             yield (
-                f"disturbance has the constant part {errors.brief(constant.tolist())} N m, but {key} is {limit:g} N m: "
+                f"disturbance reaches {largest} N m, but {key} is {limit:g} N m: "
                 f"the actuators cannot hold the attitude, which needs {needed:.3g} N m {each}"
             )
 

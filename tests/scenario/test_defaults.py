@@ -478,21 +478,28 @@ def test_a_required_input_of_another_plant_beyond_its_limit_causes_a_warning(lim
     assert [one.startswith("requirements.peak_torque is 3, but") for one in found] == [True] * said
 
 
+VIBRATION = {"kind": "sinusoid", "amplitude": [20.0] * 3, "frequency": [100.0] * 3}  # beyond the Nyquist frequency
+
+
 @pytest.mark.parametrize("key", ["hardware", "wheels"])
 @pytest.mark.parametrize(
     ("disturbance", "said"),
     [
         ({"kind": "constant", "amplitude": [0.0, -1.05, 0.0]}, True),
         ({"kind": "constant", "amplitude": ["0.95 N m", 0.0, 0.0]}, False),
-        ({"kind": "sinusoid", "amplitude": [20.0] * 3, "bias": [0.95, 0.0, 0.0]}, False),  # fast vibration
-        ({"kind": "sinusoid", "bias": [1.05, 0.0, 0.0]}, True),
+        (VIBRATION | {"bias": [0.95, 0.0, 0.0]}, False),
+        (VIBRATION | {"bias": [1.05, 0.0, 0.0]}, True),
+        ({"kind": "sinusoid", "amplitude": [0.0, -1.05, 0.0], "frequency": [0.1, 0.1, 0.1]}, True),
+        ({"kind": "sinusoid", "amplitude": [0.95, 0.0, 0.0], "frequency": [0.1, 0.1, 0.1]}, False),
+        ({"kind": "sinusoid", "amplitude": [0.6, 0.0, 0.0], "bias": [-0.6, 0.0, 0.0]}, True),
         ({"kind": "sum", "terms": [{"kind": "constant", "amplitude": [0.6, 0.0, 0.0]}] * 2}, True),
+        ({"kind": "sum", "terms": [VIBRATION, {"kind": "sinusoid", "amplitude": [0.0, 0.0, 1.05]}]}, True),
         ({"kind": "gravity_gradient"}, False),
         ({"kind": "none"}, False),
     ],
     ids=str,
 )
-def test_a_constant_disturbance_beyond_the_torque_limit_causes_a_warning(key, disturbance, said):
+def test_a_disturbance_beyond_the_torque_limit_causes_a_warning(key, disturbance, said):
     """The limit of the torque about a body axis is 1 N m."""
     limits = {"hardware": 1.0, "wheels": 1.0 / PYRAMID}
     tables = {"loop": {"mode": "sampled"}, "disturbance": disturbance, key: {"torque_limit": limits[key]}}
