@@ -300,8 +300,8 @@ def _to_study(what: Scenario | Study | str | Path) -> Study:
 def verdicts(what: Scenario | Study | str | Path, rows: pl.DataFrame, *, seed: int = 0) -> list[Verdict]:
     """Return one verdict for each requirement of a scenario over the rows of trials.
 
-    A failed trial violates all requirements on runs. Margins come from the linearised loop, see `margin_verdicts`. If
-    loops differ between trials, they come from the trials of this seed.
+    A failed trial violates all requirements. Margins come from the linearised loop, see `margin_verdicts`. If loops
+    differ between trials, they come from the trials of this seed.
 
     Args:
         what: a scenario, the path of its file, or a study.
@@ -323,7 +323,9 @@ def verdicts(what: Scenario | Study | str | Path, rows: pl.DataFrame, *, seed: i
     missing = [name for name in needed if name not in rows.columns]
     if missing or not rows.height:
         raise ValueError(f"the rows have no {missing[0]}" if missing else "there are no rows, but must be one at least")
-    on_margins = margin_verdicts.judge_trials(_to_study(what), seed) if scenario.margin_requirements(loaded) else []
+    on_margins = list[Verdict]()
+    if scenario.margin_requirements(loaded):
+        on_margins = margin_verdicts.judge_trials(_to_study(what), seed, None, campaign.has_finished(rows))
     return [*campaign.verdicts(required, rows), *on_margins]
 
 

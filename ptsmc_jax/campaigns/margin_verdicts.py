@@ -34,7 +34,7 @@ ASSUMED_ERROR = {"gain_margin": 0.06, "phase_margin": 0.12, "delay_margin": 0.2,
 NOT_INTERPOLATED = (0.0, margins.LARGEST_MARGIN, -margins.LARGEST_MARGIN, 180.0, -180.0)
 
 
-def judge_loop(parts: Parts, required: Sequence[Requirement], *, finished: bool = True) -> list[Verdict]:
+def judge_loop(parts: Parts, required: Sequence[Requirement], *, finished: ArrayLike = True) -> list[Verdict]:
     """Return the verdict on each required margin of the loop of these parts, see `run_margins.judge_run`.
 
     There are no margins if the nominal run does not come to rest, see `limit_cycles`. A loop that is open in the hold
@@ -43,33 +43,43 @@ def judge_loop(parts: Parts, required: Sequence[Requirement], *, finished: bool 
     Args:
         parts: the sampled parts.
         required: the requirements on margins.
-        finished: whether the run of these parts reached its end. Otherwise no requirement is met.
+        finished: whether the runs of these parts reached their end, bool or (runs,). If one failed, no requirement is
+            met.
     """
     if not required:
         return []
-    if finished:
+    if np.all(finished):
         values, hold, _ = run_margins.judge_run(parts, with_delay=_with_delay(required))
         if not (values.is_open & hold[:, None]).any():
             return _verdicts(required, values.worst())
     return _verdicts(required, {requirement.metric: np.nan for requirement in required})
 
 
-def judge_trials(ready: Study, seed: int, rows: np.ndarray | Row | None = None) -> list[Verdict]:
+def judge_trials(
+    ready: Study, seed: int, rows: np.ndarray | Row | None = None, finished: ArrayLike = True
+) -> list[Verdict]:
     """Return the verdict on each required margin: of the nominal loop, or the worst of the first `TRIALS` trials.
+
+    A trial that failed meets no requirement.
 
     Args:
         ready: the scenario, ready to simulate.
         seed: seed of the dispersions.
         rows: rows of a run table, instead of the first trials.
+        finished: whether each simulated trial reached its end, (trials,) bool from the first trial on.
 
     Returns:
         The verdicts. The nominal run decides whether runs come to rest.
     """
     trials = _select_trials(ready, rows)
     if trials is None or limit_cycles.find(ready.parts) is not None:
-        return judge_loop(ready.parts, ready.margins)
+        return judge_loop(ready.parts, ready.margins, finished=finished)
     limits = {requirement.metric: requirement.limit for requirement in ready.margins}
-    return _verdicts(ready.margins, worst_margins(ready.parts, ready.dispersion, seed, trials, limits))
+    by_name = worst_margins(ready.parts, ready.dispersion, seed, trials, limits)
+    for values in by_name.values():
+        simulated = np.atleast_1d(finished)[: values.size]
+        values[: simulated.size][~simulated] = np.nan
+    return _verdicts(ready.margins, by_name)
 
 
 def prepare(ready: Study, rows: np.ndarray | Row | None = None) -> None:

@@ -15,7 +15,7 @@ import pytest
 
 import ptsmc_jax as ptsmc
 from ptsmc_jax import explore, scenario
-from ptsmc_jax.campaigns import margin_verdicts, runs, store
+from ptsmc_jax.campaigns import campaign, margin_verdicts, runs, store
 from ptsmc_jax.simulation import catalogues, rollout
 from ptsmc_jax.simulation.requirements import Requirement, Verdict, violation_ratio
 from ptsmc_jax.theory import margins, run_margins
@@ -259,6 +259,17 @@ def test_loops_that_a_torque_limit_opens_in_the_hold_phase_have_no_margins():
     assert np.all(found["c"].max(axis=1) >= 1.0)
 
 
+def test_a_trial_that_failed_meets_no_required_margin(drawn):
+    all_finished = margin_verdicts.judge_trials(drawn.ready, 3, None, np.ones(2, bool))
+    for limit, before in zip(drawn.ready.margins, all_finished, strict=True):
+        # every loop keeps this limit
+        loose = dataclasses.replace(limit, limit=before.worst)
+        ready = dataclasses.replace(drawn.ready, margins=(loose,))
+        (verdict,) = margin_verdicts.judge_trials(ready, 3, None, np.array([True, False]))
+        assert (verdict.failures, verdict.trials, verdict.met) == (1, TRIALS, False)
+        assert np.isnan(verdict.worst)
+
+
 @pytest.mark.long
 def test_margin_gradients_with_dispersed_inertia_compile_if_delta_is_free():
     """Delta is free by default. The test starts another process, because XLA aborted it in an earlier version."""
@@ -425,6 +436,27 @@ def test_assumed_error_of_delay_margins_is_a_fraction_of_a_period(monkeypatch, p
     found = margin_verdicts.worst_margins(nothing, nothing, 3, np.arange(32), {"delay_margin": limit})
     np.testing.assert_array_equal(found["delay_margin"], delays)
     assert seen == judged
+
+
+def test_margins_of_a_campaign_are_judged_with_the_trials_that_failed(command, tmp_path, monkeypatch):
+    """Trials that a later command adds count, too. The shard without the first trials leaves the verdict to another."""
+    judged = []
+
+    def judge_trials(ready, seed, rows, finished):
+        judged.append(finished.tolist())
+        return [ready.margins[0].verdict(np.asarray(7.0), np.asarray(True))]
+
+    monkeypatch.setattr(margin_verdicts, "judge_trials", judge_trials)
+    monkeypatch.setattr(margin_verdicts, "prepare", lambda *_: None)
+    monkeypatch.setattr(campaign, "has_finished", lambda frame: np.arange(frame.height) != 1)
+    tables = {**untuned(SHORT_CHAIN), "requirements": {"gain_margin": 0.1}}
+    store.write_toml(tmp_path / "s.toml", tables)
+    run = ("montecarlo", "s.toml", "--no-figures", "--quiet", "--trials")
+    command(*run, 2, "--shard", "2/2")
+    assert not judged
+    command(*run, 2)
+    command(*run, 3)
+    assert judged == [[True, False], [True, False, True]]
 
 
 @pytest.mark.parametrize(

@@ -93,17 +93,20 @@ def test_bound_and_margins_use_the_first_trials_and_are_computed_once(tmp_path, 
         asked.append((ready, seed, first))
         return 1e-6
 
-    def of_trials(ready, seed, some):
+    def of_trials(ready, seed, some, finished):
+        assert finished.tolist() == [True, False]
         asked.append((ready, seed, None if some is None else len(some)))
         return []
 
     monkeypatch.setattr(runs, "rms_lower_bound", lower_bound)
     monkeypatch.setattr(margin_verdicts, "judge_trials", of_trials)
+    monkeypatch.setattr(campaign_theory, "_judged_trials_finished", lambda _: np.array([True, False]))
     table = SimpleNamespace(count=count, row=lambda k, seed: (k, seed), rows=lambda numbers, seed: np.asarray(numbers))
-    simulated = SimpleNamespace(ready="ready", run_table=None if count is None else table)
+    ready = SimpleNamespace(margins=("gain_margin",))
+    simulated = SimpleNamespace(ready=ready, run_table=None if count is None else table)
     folder: Any = SimpleNamespace(path=tmp_path, seed=7, campaign=simulated, scenario=SimpleNamespace(requirements={}))
     campaign_theory.write_missing(folder)
-    assert asked == [("ready", 7, looked), ("ready", 7, [(k, 7) for k in rows])]
+    assert asked == [(ready, 7, looked), (ready, 7, [(k, 7) for k in rows])]
     assert json.loads((tmp_path / "theory.json").read_text()) == {"lower_bound": 1e-6, "margins": []}
     campaign_theory.write_missing(folder)
     assert len(asked) == 2

@@ -297,8 +297,8 @@ def begin(folder: Folder, force: bool) -> None:
     if force and path.is_dir():
         for stored_rows in (folder.rows, folder.dry_run_rows):
             stored_rows.tidy(())
-        for name in (campaign_theory.FILE, *([TABLE] if RUN_TABLE in versions else [])):
-            (path / name).unlink(missing_ok=True)
+        if RUN_TABLE in versions:
+            (path / TABLE).unlink(missing_ok=True)
     elif _contains_campaign(folder, tables):
         return
 
@@ -313,6 +313,7 @@ def begin(folder: Folder, force: bool) -> None:
         for file in earlier_sources:  # only now, because these files may be the source of the copy
             file.unlink(missing_ok=True)
         store.remove_summary(path)  # delete results of another campaign, or of fewer trials
+        (path / campaign_theory.FILE).unlink(missing_ok=True)
 
     store.write_folder(path, write_files)
 

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
-from ptsmc_jax.campaigns import margin_verdicts, runs, store
+from ptsmc_jax.campaigns import campaign as running
+from ptsmc_jax.campaigns import margin_verdicts, rows, runs, store
 from ptsmc_jax.dispersions.variation import Row
 from ptsmc_jax.simulation import catalogues
 from ptsmc_jax.simulation.requirements import Verdict
@@ -32,16 +33,21 @@ class _Theory(msgspec.Struct):
 def write_missing(folder: "Folder") -> None:
     """Write `theory.json` if it is missing, incomplete or damaged.
 
-    It has the lower bound of the RMS window error, and the verdicts on the required stability margins.
+    It has the lower bound of the RMS window error, and the verdicts on the required stability margins. If margins are
+    required, nothing is written before the trials that they are judged on are simulated.
     """
-    if _lacks_theory(folder):
-        ready, table = folder.campaign.ready, folder.campaign.run_table
-        bound_trials = 0 if table is None else min(runs.BOUND_TRIALS, table.count)
-        first_rows = [] if table is None else [table.row(k, folder.seed) for k in range(bound_trials)]
-        verdicts = margin_verdicts.judge_trials(ready, folder.seed, _rows_with_margins(folder))
-        lower_bound = runs.rms_lower_bound(ready, folder.seed, first_rows)
-        theory = {"lower_bound": lower_bound, "margins": [verdict.in_summary() for verdict in verdicts]}
-        store.write_json(folder.path / FILE, theory)
+    if not _lacks_theory(folder):
+        return
+    ready, table = folder.campaign.ready, folder.campaign.run_table
+    finished = _judged_trials_finished(folder) if ready.margins else np.zeros(0, bool)
+    if finished is None:
+        return
+    bound_trials = 0 if table is None else min(runs.BOUND_TRIALS, table.count)
+    first_rows = [] if table is None else [table.row(k, folder.seed) for k in range(bound_trials)]
+    verdicts = margin_verdicts.judge_trials(ready, folder.seed, _rows_with_margins(folder), finished)
+    lower_bound = runs.rms_lower_bound(ready, folder.seed, first_rows)
+    theory = {"lower_bound": lower_bound, "margins": [verdict.in_summary() for verdict in verdicts]}
+    store.write_json(folder.path / FILE, theory)
 
 
 def prepare(folder: "Folder") -> None:
@@ -54,6 +60,15 @@ def prepare(folder: "Folder") -> None:
 def _lacks_theory(folder: "Folder") -> bool:
     theory = read(folder)
     return "lower_bound" not in theory or bool(margins_without_verdict(folder, theory))
+
+
+def _judged_trials_finished(folder: "Folder") -> np.ndarray | None:
+    """Return which of the trials with margins reached their end; None: another shard has not simulated them yet."""
+    parts, _ = folder.rows.parts()
+    judged = min(margin_verdicts.TRIALS, folder.trials)
+    if running.missing_parts(parts, judged):
+        return None
+    return running.has_finished(rows.read(parts, ["status"]).head(judged))
 
 
 def _rows_with_margins(folder: "Folder") -> np.ndarray | Row | None:

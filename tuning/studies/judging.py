@@ -129,7 +129,7 @@ def verdicts_of(
         return trials.metrics[name][selection]  # KeyError instead of NaN if the trials lack a required metric
 
     simulated = requirements.verdicts(ready.requirements, values, trials.finished[selection])
-    return [*simulated, *margin_verdicts.judge_trials(ready, held_out_seed)]
+    return [*simulated, *margin_verdicts.judge_trials(ready, held_out_seed, None, trials.finished)]
 
 
 def meets_requirements(verdicts: Sequence[Verdict], trials: Trials) -> bool:

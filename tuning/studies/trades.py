@@ -231,7 +231,8 @@ class Margins(Trade):
     def costs(self, tuned: Scenario, trials: Trials, seed: int) -> dict[str, float]:
         """Return the largest peak torque [N m], and the worst margins of the held-out trials' loops."""
         with_margins = scenarios.replace(tuned, requirements=dict.fromkeys(MARGINS, 1.0))
-        verdicts = margin_verdicts.judge_trials(study(judging.on_flight_clock(with_margins)), seed)
+        ready = study(judging.on_flight_clock(with_margins))
+        verdicts = margin_verdicts.judge_trials(ready, seed, None, trials.finished)
         return {TORQUE: judging.required_quantile(TORQUE, tuned, trials)} | {v.metric: v.worst for v in verdicts}
 
     def options(self) -> dict[str, object]:
