@@ -73,6 +73,7 @@ tables below.
 | `failures` | - | number of trials beyond the limit or without a value |
 | `trials` | - | number of judged trials; for a margin, number of judged loops |
 | `met` | - | whether the requirement is met |
+| `reason` | - | why a margin has no value; else empty |
 
 The requirement is met if `margin` is at most 1. A `margin` of 1.1 is 10 % beyond the limit. With a quantile, `margin`
 uses the value at the quantile instead of `worst`. For a fraction of the time, `margin` is the fraction beyond

@@ -1,6 +1,7 @@
 """Verdicts on required margins: of the nominal loop, or over the trials if dispersions change the loop."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -30,6 +31,10 @@ EXACT_PER_CALL = 16  # loops whose exact margins are computed at a time
 DELAY = "delay_margin"  # the only margin that needs loops with a delay by a fraction of a period
 # first guess for the error of `margins.estimate`, in dB, deg, periods, dB; see `worst_margins`
 ASSUMED_ERROR = {"gain_margin": 0.06, "phase_margin": 0.12, "delay_margin": 0.2, "peak_sensitivity": 0.01}
+# causes of a missing margin
+FAILED = "the run failed"
+OPEN = "the loop is open in the hold phase"
+NOT_DIFFERENTIABLE = "the loop is not differentiable"
 # exact results of `margins.estimate`: the loop is unstable, or no gain or phase makes it unstable
 NOT_INTERPOLATED = (0.0, margins.LARGEST_MARGIN, -margins.LARGEST_MARGIN, 180.0, -180.0)
 
@@ -48,11 +53,12 @@ def judge_loop(parts: Parts, required: Sequence[Requirement], *, finished: Array
     """
     if not required:
         return []
-    if np.all(finished):
-        values, hold, _ = run_margins.judge_run(parts, with_delay=_with_delay(required))
-        if not (values.is_open & hold[:, None]).any():
-            return _verdicts(required, values.worst())
-    return _verdicts(required, {requirement.metric: np.nan for requirement in required})
+    no_margins, failed = {requirement.metric: np.nan for requirement in required}, ~np.asarray(finished)
+    if failed.any():
+        return _verdicts(required, no_margins, {FAILED: failed})
+    values, hold, _ = run_margins.judge_run(parts, with_delay=_with_delay(required))
+    is_open = (values.is_open & hold[:, None]).any()
+    return _verdicts(required, no_margins if is_open else values.worst(), {OPEN: is_open})
 
 
 def judge_trials(
@@ -75,11 +81,12 @@ def judge_trials(
     if trials is None or limit_cycles.find(ready.parts) is not None:
         return judge_loop(ready.parts, ready.margins, finished=finished)
     limits = {requirement.metric: requirement.limit for requirement in ready.margins}
-    by_name = worst_margins(ready.parts, ready.dispersion, seed, trials, limits)
-    for values in by_name.values():
-        simulated = np.atleast_1d(finished)[: values.size]
-        values[: simulated.size][~simulated] = np.nan
-    return _verdicts(ready.margins, by_name)
+    by_name, is_open = worst_margins(ready.parts, ready.dispersion, seed, trials, limits)
+    failed = np.zeros_like(is_open)
+    simulated = np.atleast_1d(finished)[: failed.size]
+    failed[: simulated.size] = ~simulated
+    by_name = {name: np.where(failed, np.nan, values) for name, values in by_name.items()}
+    return _verdicts(ready.margins, by_name, {FAILED: failed, OPEN: is_open & ~failed})
 
 
 def prepare(ready: Study, rows: np.ndarray | Row | None = None) -> None:
@@ -105,10 +112,29 @@ def _select_trials(ready: Study, rows: np.ndarray | Row | None) -> np.ndarray | 
     return np.arange(TRIALS) if rows is None else rows
 
 
-def _verdicts(required: Sequence[Requirement], by_name: Mapping[str, ArrayLike]) -> list[Verdict]:
-    """Return the verdict on each required margin, from the values of one or many loops by name."""
-    values = [np.asarray(by_name[requirement.metric]) for requirement in required]
-    return [r.verdict(value, np.asarray(~np.isnan(value))) for r, value in zip(required, values, strict=True)]
+def _verdicts(
+    required: Sequence[Requirement], by_name: Mapping[str, ArrayLike], causes: Mapping[str, np.ndarray]
+) -> list[Verdict]:
+    """Return the verdict on each required margin.
+
+    Args:
+        required: the required margins.
+        by_name: the margins of one loop, (), or of many loops, (loops,), by name; NaN if a loop has no margin.
+        causes: which trials have no margin for a cause, bool, by cause. The other missing margins have the cause
+            `NOT_DIFFERENTIABLE`.
+    """
+    results, trials = [], max(map(np.size, causes.values()))
+    for requirement in required:
+        values = np.asarray(by_name[requirement.metric])
+        counts = {cause: int(np.sum(mask)) for cause, mask in causes.items()}
+        counts[NOT_DIFFERENTIABLE] = int(np.sum(np.isnan(values))) - sum(counts.values())
+        reason = " and ".join(
+            cause if trials == 1 else f"{cause} in {count} trial{'s' if count > 1 else ''}"
+            for cause, count in counts.items()
+            if count > 0
+        )
+        results.append(replace(requirement.verdict(values, ~np.isnan(values)), reason=reason))
+    return results
 
 
 def has_different_loops(dispersion: Dispersion) -> bool:
@@ -138,8 +164,8 @@ def worst_margins(
     trials: np.ndarray | Row,
     limits: Mapping[str, float],
     places: int = 1,
-) -> dict[str, np.ndarray]:
-    """Return the worst margins of each trial over its axes and times, (trials,), by name.
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Return the worst margins of each trial over its axes and times, by name, and which loops are open in hold.
 
     A trial has NaN if its loop is open in the hold phase, or has no finite derivatives.
 
@@ -161,12 +187,12 @@ def worst_margins(
         places: number of trials, nearest to a limit, whose margins are exact.
 
     Returns:
-        The margins by name.
+        The margins, (trials,), by name. Then whether the loop of each trial is open in the hold phase, (trials,) bool.
     """
     names, count = tuple(limits), jax.tree.leaves(trials)[0].shape[0]
     with_delay = DELAY in names
     padded_results = _loops_and_margins(*_arguments(parts, dispersion, seed, trials, with_delay))
-    loops, estimates = jax.tree.map(lambda v: np.asarray(v)[:count].reshape(-1, *v.shape[2:]), padded_results)
+    loops, estimates, is_open = jax.tree.map(lambda v: np.asarray(v)[:count].reshape(-1, *v.shape[2:]), padded_results)
     values = np.stack([estimates[name] for name in names])  # (margins, loops)
     limit = np.asarray([limits[name] for name in names])[:, None]
     error = np.asarray([[ASSUMED_ERROR[name] * (loops.period[0] if name == DELAY else 1.0)] for name in names]) / limit
@@ -180,7 +206,8 @@ def worst_margins(
         order = np.argsort(-np.where(is_undecided, high, -np.inf).max(axis=0), kind="stable")
         chosen = order[: min(EXACT_PER_CALL, np.count_nonzero(is_undecided.any(axis=0)))]
         if not chosen.size:
-            return {name: _worst_value(name, v.reshape(count, -1)) for name, v in zip(names, values, strict=True)}
+            by_name = {name: _worst_value(name, v.reshape(count, -1)) for name, v in zip(names, values, strict=True)}
+            return by_name, is_open.reshape(count, -1).any(axis=1)
         chosen = np.resize(chosen, EXACT_PER_CALL)  # always the same shape, so that one program is compiled
         chosen_loops = jax.tree.map(lambda v, chosen=chosen: v[chosen], loops)
         exact_by_name = margins.compute_each(chosen_loops, with_delay=with_delay).by_name()
@@ -217,10 +244,10 @@ def _worst_value(name: str, values: Any) -> Any:
 @programs.jit(static_argnames=("devices", "with_delay"), title="the margins of many trials")
 def _loops_and_margins(
     parts: Parts, dispersion: Dispersion, seed: Array, trials: Array | Row, devices: int, with_delay: bool
-) -> tuple[linear.Loop, dict[str, Array]]:
-    """Return the loops of each trial, (trials, times, ..), and their interpolated margins, the worst over the axes.
+) -> tuple[linear.Loop, dict[str, Array], Array]:
+    """Return the loops of each trial, (trials, times, ..), their interpolated margins, and which are open in hold.
 
-    A loop that is open in the hold phase has NaN.
+    The margins are the worst over the axes. A loop that is open in the hold phase has NaN.
 
     with_delay: the loops allow delays by a fraction of a period, see `linear.linearise_period`.
     """
@@ -237,14 +264,14 @@ def _loops_and_margins(
     def loops_of_trial(drawn: Parts, run: linear.NominalRun) -> linear.Loop:
         return run_margins.judged_loops(drawn, run, fractional_delays=with_delay)[0]
 
-    def analyse_trials(trials: Array | Row) -> tuple[linear.Loop, dict[str, Array]]:
+    def analyse_trials(trials: Array | Row) -> tuple[linear.Loop, dict[str, Array], Array]:
         loops = lapack.vmap(loops_of_trial)(*lanes.vmap(simulate_trial)(trials))
         by_loop = jax.lax.map(interpolate_margins, jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), loops))
         values, is_open = jax.tree.map(lambda v: v.reshape(LOOPS_PER_CALL, -1), by_loop)
         is_open = is_open.at[:, :-1].set(False)  # the last loop of a trial is in the hold phase
-        return loops, {name: jnp.where(is_open, jnp.nan, v) for name, v in values.items()}
+        return loops, {name: jnp.where(is_open, jnp.nan, v) for name, v in values.items()}, is_open
 
-    def analyse_on_device(trials: Array | Row) -> tuple[linear.Loop, dict[str, Array]]:
+    def analyse_on_device(trials: Array | Row) -> tuple[linear.Loop, dict[str, Array], Array]:
         calls = jax.lax.map(analyse_trials, jax.tree.map(lambda v: v.reshape(-1, LOOPS_PER_CALL, *v.shape[1:]), trials))
         return jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), calls)
 

@@ -96,6 +96,7 @@ class Verdict:
     # fraction of the time within the limit: the smallest of all runs, or, mixed, the mean over the runs
     fraction_of_time: float | None = None
     shown: float | None = None  # lower bound on `fraction_of_time` at the confidence level `confidence`
+    reason: str = ""  # why a margin has no value, in words
 
     @property
     def met(self) -> bool:
@@ -173,7 +174,7 @@ class Verdict:
             result = "unlimited"  # an infinite margin, which JSON cannot store
         elif math.isnan(worst):
             result = "no value" if trials == 1 else "no worst value"
-            result += ", as the run failed or the loop is open or not differentiable" if noun == "loops" else ""
+            result += f", as {self.reason}" if self.reason else ""
         else:
             loop_count = f"of {trials} dispersed loops " if noun == "loops" else ""
             result = (f"worst {loop_count}" if trials > 1 else "") + quantity(worst, self.unit, 4, self.metric)

@@ -129,7 +129,7 @@ def loops_and_margins(parts, dispersion, seed, late):
     If `late` is set, the loops allow delays by a fraction of a period.
     """
     arguments = margin_verdicts._arguments(parts, dispersion, seed, np.arange(TRIALS), late)
-    every = margin_verdicts._loops_and_margins(*arguments)
+    *every, _ = margin_verdicts._loops_and_margins(*arguments)
     return jax.tree.map(lambda v: np.asarray(v)[:TRIALS], every)
 
 
@@ -255,6 +255,7 @@ def test_loops_that_a_torque_limit_opens_in_the_hold_phase_have_no_margins():
     parts = dataclasses.replace(asked.parts, actuators=weak)
     verdicts = margin_verdicts.judge_trials(dataclasses.replace(posed.ready, parts=parts), 3)
     assert [(verdict.failures, verdict.trials, verdict.met) for verdict in verdicts] == [(TRIALS, TRIALS, False)] * 2
+    assert {verdict.reason for verdict in verdicts} == {"the loop is open in the hold phase in 6 trials"}
     found = sloped(dataclasses.replace(asked, parts=parts), bounds, bounds.normalise(posed.scenario_gains))
     assert np.all(found["c"].max(axis=1) >= 1.0)
 
@@ -268,6 +269,7 @@ def test_a_trial_that_failed_meets_no_required_margin(drawn):
         (verdict,) = margin_verdicts.judge_trials(ready, 3, None, np.array([True, False]))
         assert (verdict.failures, verdict.trials, verdict.met) == (1, TRIALS, False)
         assert np.isnan(verdict.worst)
+        assert str(verdict).endswith("no worst value, as the run failed in 1 trial: NOT met in 1 of 6 loops")
 
 
 @pytest.mark.long
@@ -392,7 +394,7 @@ def test_worst_margins_are_exact_without_exact_margins_of_all_loops(drawn, facto
         monkeypatch.setattr(margin_verdicts, "ASSUMED_ERROR", known)
         for names in (list(limits), ["phase_margin", list(limits)[2]], ["phase_margin"]):
             asked = {name: limits[name] for name in names}
-            found = margin_verdicts.worst_margins(parts, dispersion, 3, np.arange(TRIALS), asked, places=2)
+            found, _ = margin_verdicts.worst_margins(parts, dispersion, 3, np.arange(TRIALS), asked, places=2)
             ratio = margin_verdicts.signed_violation_ratio
             near = [np.max([ratio(one[n], limits[n], n) for n in names], 0) for one in (each, found)]
             first = [np.argsort(-v, kind="stable")[:2] for v in near]
@@ -422,7 +424,8 @@ def test_assumed_error_of_delay_margins_is_a_fraction_of_a_period(monkeypatch, p
 
     def looked(*given):
         assert given[-1] is True  # with delay margins
-        return _Told(np.arange(32)[:, None], np.full((32, 1), period)), {"delay_margin": delays[:, None]}
+        loops = _Told(np.arange(32)[:, None], np.full((32, 1), period))
+        return loops, {"delay_margin": delays[:, None]}, np.zeros((32, 1), bool)
 
     def of_each(loops, with_delay):
         assert with_delay
@@ -433,7 +436,7 @@ def test_assumed_error_of_delay_margins_is_a_fraction_of_a_period(monkeypatch, p
     monkeypatch.setattr(margin_verdicts, "EXACT_PER_CALL", 16)
     monkeypatch.setattr(margin_verdicts.margins, "compute_each", of_each)
     nothing: Any = None
-    found = margin_verdicts.worst_margins(nothing, nothing, 3, np.arange(32), {"delay_margin": limit})
+    found, _ = margin_verdicts.worst_margins(nothing, nothing, 3, np.arange(32), {"delay_margin": limit})
     np.testing.assert_array_equal(found["delay_margin"], delays)
     assert seen == judged
 

@@ -254,12 +254,13 @@ def test_saturated_command_is_reported_as_an_open_loop():
 def test_simulate_does_not_meet_a_required_margin_of_an_open_loop_or_a_failed_run():
     """Earlier, the margins of an open loop counted as unlimited, and those of a failed run as the linearised ones."""
     disturbance = {"amplitude": [1e300], "frequency": [1.0]}  # the linearised loop has no disturbance
-    failing = limited_to(50.0), {"disturbance": disturbance}
-    for (base, changes), status in (((limited_to(0.02), {}), "not_converged"), (failing, "diverged")):
+    opened = limited_to(0.02), {}, "not_converged", "the loop is open in the hold phase"
+    failing = limited_to(50.0), {"disturbance": disturbance}, "diverged", "the run failed"
+    for base, changes, status, reason in (opened, failing):
         run = explore.simulate(scenario.replace(base, requirements={"gain_margin": 0.1}, **changes)).run
         (verdict,) = run.verdicts
         assert (run.status, verdict.met) == (status, False)
-        assert str(verdict).startswith("gain_margin at least 0.1 dB: no value, as the run failed or the loop is open")
+        assert str(verdict).startswith(f"gain_margin at least 0.1 dB: no value, as {reason}: NOT met")
 
 
 def blamed_on_no_limit(found, first, limited):

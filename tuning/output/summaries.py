@@ -36,6 +36,7 @@ class Entry(msgspec.Struct, frozen=True):
     interpretation: str = "ensemble"
     fraction_of_time: Number = None
     shown: Number = None
+    reason: str = ""
     # only in a campaign: fraction of trials within the limit, its interval and lower bound, and enough trials
     fraction: Number = None
     fraction_interval: Interval = None

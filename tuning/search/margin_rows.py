@@ -99,7 +99,7 @@ def select_hardest_trials(asked: RequiredMargins, gains: Float[np.ndarray, " gai
         return asked, 0.0
     parts, seed = with_gains(asked.parts, dict(zip(asked.names, gains, strict=True))), int(asked.seed)
     limits = dict(zip(asked.metrics, np.asarray(asked.required).tolist(), strict=True))
-    by_trial = margin_verdicts.worst_margins(
+    by_trial, _ = margin_verdicts.worst_margins(
         parts, asked.dispersion, seed, np.arange(margin_verdicts.TRIALS), limits, CASES
     )
     ratios = [margin_verdicts.signed_violation_ratio(by_trial[name], limit, name) for name, limit in limits.items()]
