@@ -431,9 +431,10 @@ def identified(**changes: Any) -> Report:
 def approach(judged: bool) -> Report:
     """Return the report of a loop that is unstable at one sample of the approach phase."""
     left = dict.fromkeys(("gain_up", "gain_down", "phase", "delay", "peak_sensitivity"), 6.0)
+    sample = {"time_to_go": 1.0, "judged": judged, "stable": False, "open": [], "cut": [], **left, "delay": None}
     summary = {
         "stable": True, "open": [], "cut": [], "note": None, "hold": {"u1": left}, "together": left, "sensors": {},
-        "before": [{"time_to_go": 1.0, "judged": judged, "stable": False, "open": [], "cut": []}],
+        "before": [sample],
         "worst": {"gain_margin": -1.9, "phase_margin": None, "delay_margin": None, "peak_sensitivity": None},
     }  # fmt: skip
     return margins_report.build(summaries.read(summaries.Margins, summary))

@@ -38,10 +38,15 @@ def test_margins_command_writes_table_figures_and_page(command, tmp_path, plant)
     folder = tmp_path / "out" / "margins-s"
     assert status == 0
     assert "gain up [dB]  gain down [dB]" in out
-    assert out.startswith("The nominal loop is stable; smallest margins at one input: gain ")
+    assert out.startswith("The nominal loop is stable; smallest margins at one input in both phases: gain ")
     assert {p.name for p in (folder / "figures").iterdir()} == {"nichols.png", "sensitivity.png", "margins.png"}
     found = json.loads((folder / "summary.json").read_text())
     of_axes(tables(folder / "margins.csv"), found, names, seen)
+    # the table has the margins of the headline
+    rows = margins_report.margin_table(summaries.read(summaries.Margins, found)).rows
+    at_inputs = [row for row in rows if row[0].removeprefix("worst ").startswith("input")]
+    assert {row[1] for row in at_inputs} == {"hold", "approach"}
+    assert min(float(row[5]) for row in at_inputs) == pytest.approx(found["worst"]["delay_margin"], rel=1e-2)
     # the gain margin of one axis is at least the margin of all axes together
     alone = min(one["gain_up"] for one in found["hold"].values())
     assert found["together"]["gain_up"] <= alone * (1 + 1e-6)

@@ -29,25 +29,34 @@ def build(summary: Margins) -> Report:
         headline, mood = f"Stable in the hold phase, NOT stable in the approach phase; {_format_worst(summary)}", "bad"
     else:
         headline, mood = f"The nominal loop is stable; {_format_worst(summary)}", "calm"
-    return Report(
-        headline, mood, list(_condition_lines(summary)), [Section("Margins in the hold phase", [margin_table(summary)])]
-    )
+    return Report(headline, mood, list(_condition_lines(summary)), [Section("Margins", [margin_table(summary)])])
 
 
 def _format_worst(summary: Margins) -> str:
-    return f"smallest margins at one input: {format_margins(summary.worst)}"
+    phases = "both phases" if any(loop["judged"] for loop in summary.before) else "the hold phase"
+    return f"smallest margins at one input in {phases}: {format_margins(summary.worst)}"
 
 
 def margin_table(summary: Margins) -> Table:
-    """Return the margins in the hold phase at each input alone, at all inputs, and at each measured state."""
+    """Return the margins in the hold phase at each input alone, at all inputs, and at each measured state.
 
-    def margin_row(where: str, margins: Numbers, unlimited: str = "none") -> tuple[str, ...]:
-        return where, *(format_number(margins[name], ".3g", unlimited) if name in margins else "-" for name in COLUMNS)
+    The last row has the worst input at the judged times of the approach phase.
+    """
 
-    rows = [margin_row(f"input {name}", margins) for name, margins in summary.hold.items()]
-    rows.append(margin_row("all inputs", summary.together, "none" if summary.stable else "-"))
-    rows += [margin_row(name, margins) for name, margins in summary.sensors.items()]
-    return Table(("loop opened at", *COLUMNS.values()), rows, "none: the margin is unlimited.")
+    def margin_row(where: str, phase: str, margins: Numbers, unlimited: str = "none") -> tuple[str, ...]:
+        cells = (format_number(margins[name], ".3g", unlimited) if name in margins else "-" for name in COLUMNS)
+        return where, phase, *cells
+
+    rows = [margin_row(f"input {name}", "hold", margins) for name, margins in summary.hold.items()]
+    rows.append(margin_row("all inputs", "hold", summary.together, "none" if summary.stable else "-"))
+    rows += [margin_row(name, "hold", margins) for name, margins in summary.sensors.items()]
+    judged = [loop for loop in summary.before if loop["judged"]]
+    if judged:
+        known = {name: [loop[name] for loop in judged if loop[name] is not None] for name in COLUMNS}
+        worst = {name: (max if name == "peak_sensitivity" else min)(values, default=None)
+                 for name, values in known.items()}  # fmt: skip
+        rows.append(margin_row("worst input", "approach", worst))
+    return Table(("loop opened at", "phase", *COLUMNS.values()), rows, "none: the margin is unlimited.")
 
 
 def _condition_lines(summary: Margins) -> Iterator[str]:
