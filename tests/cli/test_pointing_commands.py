@@ -11,10 +11,12 @@ from ptsmc_jax.campaigns import campaign, montecarlo, store
 from ptsmc_jax.numerics import statistics
 from ptsmc_jax.simulation import rollout
 from ptsmc_jax.simulation.catalogues import percent
+from ptsmc_jax.simulation.requirements import Requirement
 from tests.helpers import rows_of, short
 from tests.output.pages import checked
 from tuning.output import campaign_report, formats, summaries
 from tuning.output.report import Table
+from tuning.studies import campaign_summary
 
 ASKED = """
 [pointing]
@@ -94,10 +96,11 @@ def test_pointing_requirements_have_verdicts_budget_and_table(simulated, tmp_pat
 
     budget = found["pointing"]["budget"]
     assert set(budget) == {"ape", "mpe", "rpe", "pde", "ake", "mke", "rke"}
-    assert budget["ape"]["x"] is None  # 150 runs are too few for 99.73 %
+    # the budget has the probability and the confidence of the requirement on runs
+    assert budget["rpe"]["boresight"] == pytest.approx(ensemble["margin"] * 0.02)
     for place in (said, checked(tmp_path / FOLDER).text):
-        assert "from 0.5 s after t_f to t_end, with 95 % confidence; boresight 1, 0, 0" in place
-        assert "needs 1109 runs that all reach their end (852 for 90 % confidence)" in place
+        assert "90 % of the runs stay within the angles of this budget from 0.5 s after t_f to t_end" in place
+        assert "to t_end, with 90 % confidence; boresight 1, 0, 0" in place
         assert "ape_boresight at most 2062.65 arcsec in 50 % of the time of all runs" in place
     (section,) = campaign_report.pointing_sections(summaries.read(summaries.Campaign, found))
     table = section.blocks[-1]
@@ -133,21 +136,29 @@ def test_worst_fraction_of_time_is_the_smallest(command, simulated, tmp_path):
     assert set(why["trial"]) == set(np.argsort(within, kind="stable")[:3])
 
 
-def test_pointing_budget_is_an_order_statistic(monkeypatch, simulated):
-    from tuning.studies import campaign_summary
-
+def test_pointing_budget_is_an_order_statistic(simulated):
     rows, found = simulated[2:]
-    monkeypatch.setattr(campaign_summary, "BUDGET_FRACTION", 0.9)
-    from pathlib import Path
-
-    from tuning.studies import campaign_folder
-
-    again = campaign_summary.summarise(campaign_folder.open_folder(Path(FOLDER)))["pointing"]["budget"]
+    bound = found["pointing"]["budget"]["mpe"]["y"]
     ordered = np.sort(rows["mpe_y"].to_numpy())
-    least = next(k for k in range(1, 151) if statistics.fraction_bound(k, 150, 0.95) >= 0.9)
-    assert again["mpe"]["y"] == ordered[least - 1]
-    read = summaries.read(summaries.Campaign, {**found, "pointing": {**found["pointing"], "budget": again}})
-    assert formats.format_angle(again["mpe"]["y"]) in str(campaign_report.pointing_sections(read))
+    least = next(k for k in range(1, 151) if statistics.fraction_bound(k, 150, 0.9) >= 0.9)
+    assert bound == ordered[least - 1]
+    read = summaries.read(summaries.Campaign, found)
+    assert formats.format_angle(bound) in str(campaign_report.pointing_sections(read))
+
+
+@pytest.mark.parametrize(
+    ("required", "expected"),
+    [
+        ([], (0.9973, 0.95)),
+        ([("ape_x", 0.9, 0.8, "ensemble"), ("rpe_x", 0.9, 0.8, "ensemble")], (0.9, 0.8)),
+        ([("ape_x", 0.9, 0.8, "ensemble"), ("rpe_x", 0.9, 0.9, "ensemble")], (0.9973, 0.95)),
+        ([("ape_x", 0.9, None, "ensemble"), ("ape_y", None, None, "ensemble")], (0.9, 0.95)),
+        ([("ape_x", 0.9, 0.8, "mixed"), ("peak_torque", 0.5, 0.5, "ensemble")], (0.9973, 0.95)),
+    ],
+)
+def test_pointing_budget_has_the_probability_of_the_requirements(required, expected):
+    asked = [Requirement(metric, 1e-3, None, *numbers[:2], interpretation=numbers[2]) for metric, *numbers in required]
+    assert campaign_summary.budget_statistics(asked) == expected
 
 
 def test_single_run_has_the_pointing_indices(command, simulated, tmp_path):

@@ -176,13 +176,13 @@ def budget_lines(summary: Campaign, pointing: Row) -> Iterator[str]:
         f"t_end, with {100 * pointing['confidence']:g} % confidence; boresight {boresight}"
     )
     if any(value is None for axes in pointing["budget"].values() for value in axes.values()):
-        few, many = (fewest_trials(pointing["probability"], confidence) for confidence in REVIEW_CONFIDENCES)
+        needed = fewest_trials(pointing["probability"], pointing["confidence"])
         # runs that ended early have no angles
         ended_early = summary.simulated - summary.counts["ok"] - summary.counts.get("not_converged", 0)
-        if summary.simulated >= many and ended_early:
+        if summary.simulated >= needed and ended_early:
             yield f"an angle is - because {ended_early} runs did not reach their end"
         else:
-            yield f"an angle is - because it needs {many} runs that all reach their end ({few} for 90 % confidence)"
+            yield f"an angle is - because it needs {needed} runs that all reach their end"
 
 
 def budget_table(pointing: Row) -> Table:

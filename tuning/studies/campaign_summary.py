@@ -3,7 +3,7 @@
 All of them are computed from the rows of the campaign. Read `summarise` first.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from tuning.studies.campaign_folder import Folder
 TOLERANCE = 1e-12  # largest relative difference of equal results
 CONFIDENCE = 0.95  # confidence level of the intervals, unless a requirement has its own
 QUANTILES = (0.5, 0.9, 0.99, 0.9973)
-BUDGET_FRACTION = 0.9973  # fraction of the runs that keep a pointing budget: three sigma of a normal distribution
+BUDGET_FRACTION = 0.9973  # fraction of the runs that keep a pointing budget by default: three sigma of a normal one
 DRIVER_TRIALS = 100_000  # largest number of trials for the sensitivities to inputs
 
 
@@ -195,15 +195,32 @@ def _equal_trials(quantiles: dict[str, Any], trials: int) -> list[str]:
     return [f"all {trials} trials have the same metrics: {reason}; one trial is enough"]
 
 
+def budget_statistics(required: Iterable[Requirement]) -> tuple[float, float]:
+    """Return the fraction of runs and the confidence of the pointing budget.
+
+    They are those of the requirements on the fraction of runs that keep a limit on a pointing index. If there are none,
+    or if they differ, the result is `BUDGET_FRACTION` and `CONFIDENCE`.
+    """
+    stated = {
+        (r.quantile, r.confidence or CONFIDENCE)
+        for r in required
+        if r.metric.rpartition("_")[0] in catalogues.INDICES
+        and r.interpretation == "ensemble"
+        and r.quantile is not None
+    }
+    return stated.pop() if len(stated) == 1 else (BUDGET_FRACTION, CONFIDENCE)
+
+
 def _pointing_budget(folder: Folder, parts: list[rows.Part], finished: np.ndarray) -> dict[str, object]:
     """Return the pointing budget: an upper bound for every pointing error index and axis [rad].
 
-    At least the fraction `BUDGET_FRACTION` of all possible runs stays below the bound, with the confidence
-    `CONFIDENCE`. A bound is None if there are too few trials, or too many of them failed.
+    At least a fraction of all possible runs stays below the bound, with a confidence, see `budget_statistics`. A bound
+    is None if there are too few trials, or too many of them failed.
     """
     table = getattr(folder.scenario, "pointing", None)
     if table is None:
         return {}
+    fraction, confidence = budget_statistics(scenario.requirements(folder.scenario))
     catalogue, budget = scenario.catalogue(folder.scenario), {}
     for index in catalogues.INDICES:
         names = {axis: f"{index}_{axis}" for axis in catalogues.AXES if f"{index}_{axis}" in catalogue}
@@ -211,11 +228,11 @@ def _pointing_budget(folder: Folder, parts: list[rows.Part], finished: np.ndarra
         for axis, name in names.items():
             values = frame[name].to_numpy().astype(float)
             sorted_values = np.sort(np.where(finished & np.isfinite(values), values, np.inf))
-            rank = must_keep(sorted_values.size, BUDGET_FRACTION, CONFIDENCE)
+            rank = must_keep(sorted_values.size, fraction, confidence)
             bound = None if rank is None or not np.isfinite(sorted_values[rank - 1]) else float(sorted_values[rank - 1])
             budget.setdefault(index, {})[axis] = bound
     observed = {"boresight": table.boresight, "window": table.window, "after": table.after}
-    return {"pointing": {**observed, "probability": BUDGET_FRACTION, "confidence": CONFIDENCE, "budget": budget}}
+    return {"pointing": {**observed, "probability": fraction, "confidence": confidence, "budget": budget}}
 
 
 def _metric_statistics(values: np.ndarray, finished: np.ndarray, larger_is_better: bool) -> dict[str, Any]:
