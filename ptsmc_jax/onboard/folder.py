@@ -19,7 +19,7 @@ from ptsmc_jax.onboard.generate import Code, generate
 from ptsmc_jax.onboard.plant import plant_board
 from ptsmc_jax.onboard.sources import LAYOUT
 from ptsmc_jax.onboard.templates import ExportInfo
-from ptsmc_jax.scenario import custom, parsing
+from ptsmc_jax.scenario import custom, mission, parsing
 from ptsmc_jax.scenario.assembly import Study
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.tables import Scenario
@@ -54,7 +54,7 @@ class Controller:
         self.info = ExportInfo(
             name, source, checksum(self.scenario), type(law).__qualname__, self.board.parameters["filter"] is not None,
             self.board.model.largest_measurement,
-            device.delay, float((law.t_f / self.last_time_to_go) ** 2),
+            device.delay, float((law.t_f / self.last_time_to_go) ** 2), mission.describe_default_gains(self.scenario),
         )  # fmt: skip
 
 

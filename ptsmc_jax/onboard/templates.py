@@ -45,6 +45,7 @@ class ExportInfo(NamedTuple):
     delay: int  # delay of the commands in control periods
     # growth of rounding errors up to the hand-over, see `vectors.rounding_growth`; at least the growth of the gains
     rounding_growth: float
+    default_gains: str | None  # see `mission.describe_default_gains`
 
     @property
     def stem(self) -> str:
@@ -276,6 +277,7 @@ def stack_bytes(code: Code) -> int:
 def readme(code: Code, info: ExportInfo) -> str:
     """Return the text of README.md: interface, cost, parameters, linking."""
     counts = format_counts(code.derivation_counts)
+    gains = f"\n*Default gains*: {info.default_gains}. `ptsmc tune` searches for better gains."
     periods = f"{info.delay} control period{'s' if info.delay != 1 else ''}"
     return fill_template(
         "README.md",
@@ -283,6 +285,7 @@ def readme(code: Code, info: ExportInfo) -> str:
         law=info.law + " with its observer" + (" and attitude filter" if info.has_filter else ""),
         scenario=info.scenario,
         checksum=info.checksum,
+        gains=gains if info.default_gains else "",
         stages="\n".join(f"{k}. `{name}`: {text}" for k, (name, text) in enumerate(code.stage_descriptions.items(), 1)),
         inputs=_member_rows(code.inputs),
         outputs=_member_rows(code.outputs),

@@ -163,8 +163,34 @@ def dead_time(scenario: "Scenario") -> float:
 
 def fastest_pole(scenario: "Scenario") -> float:
     """Return the largest p [1/s] that dead time, flexible modes, and noise against the torque limit allow."""
+    return min(_pole_limits(scenario).values())
+
+
+def _pole_limits(scenario: "Scenario") -> dict[str, float]:
+    """Return the upper limits of p [1/s], by their cause in words."""
     stable = MAX_POLE_TIMES_DEAD_TIME * 2.0 / scenario.order  # n poles at -p put the crossover near n p
-    return min(stable / dead_time(scenario), _pole_limit_of_modes(scenario), _pole_limit_of_noise(scenario))
+    return {
+        "the dead time of the loop": stable / dead_time(scenario),
+        "the damping of a flexible mode": _pole_limit_of_modes(scenario),
+        "the torque limit and the noise of the sensors": _pole_limit_of_noise(scenario),
+    }
+
+
+def describe_default_gains(scenario: "Scenario") -> str | None:
+    """Return in words that the law has default gains and what sets their bandwidth; None if the file states a gain."""
+    law = scenario.controller
+    names = [name for name in law.gains if name != "t_f" and getattr(law, name) is not None]
+    if not names or not all(("controller", name) in scenario.defaulted for name in names):
+        return None
+    text = "the scenario states no gains of the law, so these are default gains"
+    if law.kind != "prescribed_time" or not scenario.sampled or is_published_case(scenario):
+        return text
+    limits, (slowest, pole, _) = _pole_limits(scenario), _pole_range(scenario)
+    cause = min(limits, key=lambda name: limits[name])
+    if not math.isclose(pole, limits[cause]):
+        needs_speed = pole > limits[cause] or math.isclose(pole, slowest)
+        cause = "controller.t_f" if needs_speed else "the noise of the sensors"
+    return f"{text} with a bandwidth set by {cause}"
 
 
 def _design(scenario: "Scenario", pole: float, eta: float, observer: float) -> Design:

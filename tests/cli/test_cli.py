@@ -328,6 +328,17 @@ def test_failed_run_is_reported(command, tmp_path):
     assert [verdict["met"] for verdict in summary["verdicts"]] == [False]
 
 
+@pytest.mark.parametrize(("gain", "limit", "is_reported"), [("", 1e-3, True), ("eta = 3.0", 1e-3, False),
+                                                            ("", 3e3, False)])  # fmt: skip
+def test_default_gains_are_reported_with_a_requirement_that_is_not_met(command, tmp_path, gain, limit, is_reported):
+    text = SHORT_CHAIN.replace("delta = 0.5", gain).replace("peak_torque = 3.0", f"peak_torque = {limit}")
+    (tmp_path / "s.toml").write_text(text)
+    axes = "--x", "loop.period=0.1:0.11:2", "--y", "controller.disturbance_bound=0.01:0.02:2", "--trials", 2
+    for name, *options in (("simulate",), ("montecarlo", "--trials", 8), ("map", *axes)):
+        _, out, err = command(name, "s.toml", "--no-figures", *options)
+        assert (("default gains; ptsmc tune searches" in out), err) == (is_reported, ""), name
+
+
 def stop_at(monkeypatch, call):
     """Interrupt this evaluation of the search (0: none). Return a list with an item for each computed evaluation.
 

@@ -34,6 +34,14 @@ def test_export_writes_a_folder_and_prints_the_cost_of_a_step(command, tmp_path,
     assert files[0] == files[1]
 
 
+def test_export_reports_default_gains(command, tmp_path):
+    for gain, count in (("eta = 3.0", 0), ("", 1)):
+        (tmp_path / "s.toml").write_text(SHORT_CHAIN.replace("delta = 0.5", gain))
+        _, out, _ = command("export", "s.toml", "--trials", 1, "--out", "c", "--force")
+        assert out.count("these are default gains") == count
+        assert (tmp_path / "c" / "README.md").read_text().count("these are default gains") == count
+
+
 def test_export_names_the_fmus_that_it_writes(command, tmp_path):
     status, out, _ = command("export", "s.toml", "--trials", 1, "--out", "c", "--fmu", "--fmi", 3, "--no-binary")
     assert status == 0

@@ -96,6 +96,7 @@ def test_dead_time_limits_the_bandwidth():
         said = sampled(hardware=hardware) if hardware else sampled()
         assert mission.dead_time(said) == pytest.approx(dead)
         assert mission.design(said).pole == pytest.approx(0.25 / dead)
+        assert "bandwidth set by the dead time" in str(mission.describe_default_gains(said))
 
 
 def test_the_designed_loop_has_the_documented_stability_margins():
@@ -121,6 +122,7 @@ def test_noise_and_the_torque_limit_limit_the_bandwidth():
     said = sampled(hardware={"rate_noise": sigma, "torque_limit": limit})
     pole = mission.design(said).pole
     assert 60.0 * 2.5 * pole * sigma == pytest.approx(0.5 * limit / 5.0)
+    assert "bandwidth set by the torque limit" in str(mission.describe_default_gains(said))
 
 
 def test_late_modes_limit_the_bandwidth_and_early_ones_do_not():
@@ -131,6 +133,17 @@ def test_late_modes_limit_the_bandwidth_and_early_ones_do_not():
     free = 12.0 / math.sqrt(1.0 - fraction)
     assert mission.design(early).pole == pytest.approx(2.0)
     assert mission.design(late).pole == pytest.approx(0.5 * 0.002 * free / (fraction / (1.0 - fraction)))
+    assert "bandwidth set by the damping of a flexible mode" in str(mission.describe_default_gains(late))
+    late = sampled(flexible={"frequency": [12.0], "damping": [1e-6], "coupling": [[0.0, 2.0, 0.0]]})
+    assert "bandwidth set by controller.t_f" in str(mission.describe_default_gains(late))
+
+
+def test_default_gains_are_described_only_if_the_file_states_no_gain():
+    assert mission.describe_default_gains(sampled(observer={"gain": [1.0, 1.0, 1.0]})) is not None
+    for law in ({"k1": 0.5}, {"kind": "pd", "k_p": 0.1}):
+        assert mission.describe_default_gains(sampled(controller={"t_f": 60.0, **law})) is None
+    for published in (scenario.from_tables({}), scenario.from_tables({"controller": {"kind": "pd"}, **SAMPLED})):
+        assert "bandwidth" not in str(mission.describe_default_gains(published))
 
 
 def test_a_weak_actuator_reduces_eta():

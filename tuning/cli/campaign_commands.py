@@ -330,6 +330,8 @@ def _summarise(folder: "Folder", quiet: bool, figures: bool, *, write: bool = Tr
             campaign_summary.write_summary(folder, summary, figures)
     if not quiet:
         terminal.print_result("montecarlo", summary, folder.scenario.plant.kind, folder.path)
+        if summary["status"] == "not met" and folder.controller is None:
+            terminal.print_gains_hint(folder.scenario)
     return 0 if summary["status"] == "met" else 1
 
 

@@ -85,6 +85,8 @@ def simulate(
         store.write_folder(folder, lambda staging: single.write(staging, *written, aem=aem))
     if not common.quiet:
         terminal.print_result("simulate", single.summary(run, loaded, computer), loaded.plant.kind, folder)
+        if not run.met and computer is None:
+            terminal.print_gains_hint(loaded)
     return 0 if run.met else 1
 
 
@@ -160,6 +162,8 @@ def map_(
         pairs = [dataclasses.asdict(cell) for cell in results.cells]
         x_label, y_label = (mapping.label_with_unit(loaded, axis.key) for axis in (x_axis, y_axis))
         terminal.print_lines(*reports.map_lines(pairs, (x_label, y_label), loaded.plant.kind), f"results in {folder}")
+        if loaded.requirements and not any(cell.meets == 1 for cell in results.cells):
+            terminal.print_gains_hint(loaded)
     return 0
 
 

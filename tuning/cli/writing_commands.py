@@ -170,6 +170,7 @@ def export(
         check = f"make -C {shlex.quote(str(folder))} check"
         outputs = ", ".join(["controller", *fmus.files])
         terminal.print_lines(f"a step takes at most {costs}", f"{outputs} in {folder}; {check}")
+        terminal.print_gains_hint(controller.scenario)
     return 0
 
 

@@ -3,9 +3,12 @@
 import contextlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tuning.output.report import Report, Table
+
+if TYPE_CHECKING:
+    from ptsmc_jax.scenario.tables import Scenario
 
 WIDE = 1000  # assumed number of columns of a file or a pipe
 UNBROKEN_WIDTH = 24  # largest number of columns of a cell that is never broken
@@ -42,6 +45,15 @@ def print_report(report: Report, folder: Path, *, earlier: bool = False) -> None
         else:
             print_lines(*content)
     print_lines("", f"results in {folder}" + (" (from an earlier run)" if earlier else ""))
+
+
+def print_gains_hint(scenario: "Scenario") -> None:
+    """Print that a scenario has default gains, and how to find better gains. Print nothing if it states its gains."""
+    from ptsmc_jax.scenario import mission
+
+    gains = mission.describe_default_gains(scenario)
+    if gains is not None:
+        print_lines(f"{gains}; ptsmc tune searches for better gains")
 
 
 def print_lines(*lines: str) -> None:
