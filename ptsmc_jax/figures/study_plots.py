@@ -29,7 +29,7 @@ from ptsmc_jax.figures.style import (
     torque_metric,
 )
 from ptsmc_jax.scenario.gain_bounds import is_log_scaled
-from ptsmc_jax.simulation.catalogues import CATALOGUES, without_norms
+from ptsmc_jax.simulation.catalogues import CATALOGUES, TORQUES, without_norms
 
 MARKERS = ("o", "^", "s", "D", "v")
 BEYOND = ("x", "+", "1", "2", "3", "4")  # markers of points that violate a limit, one for each limit
@@ -209,14 +209,15 @@ def tradeoff(
     """
     torque = torque_metric(limits)
     (convert, name, error_unit), unit = error_display(kind), CATALOGUES[kind][torque].unit
-    label = f"{torque.replace('_', ' ')} [{unit}]"
-    figure, axes = new_figure("Accuracy against torque, held-out trials", label)
+    torque_name = TORQUES[torque]
+    figure, axes = new_figure("Accuracy against torque, held-out trials", f"{torque_name} [{unit}]")
     arrays = {label: (np.asarray(e), np.asarray(u)) for label, (e, u) in sets.items()}
     looks = zip(arrays.items(), _colours_and_markers(len(arrays)), range(len(arrays), 0, -1), strict=True)
     for (label, (errors, torques)), (colour, marker), above in looks:  # the first set is drawn above the others
         rms, mean = convert(np.sqrt(np.nanmean(errors**2))), np.nanmean(torques)
         axes.loglog(convert(errors), torques, marker, ms=2.5, alpha=0.35, color=colour, mew=0, zorder=2)
-        text = f"{label.replace('_', ' ')}: RMS {float(f'{rms:.3g}'):g} {error_unit}, mean peak {mean:.3g} {unit}"
+        label = label.replace("_", " ")
+        text = f"{label}: RMS {float(f'{rms:.3g}'):g} {error_unit}, mean {torque_name} {mean:.3g} {unit}"
         axes.loglog(rms, mean, marker, ms=9, color=colour, mec="white", label=text, zorder=2 + above)
     if torque in limits:
         axes.axhline(limits[torque], **LIMIT, label=f"limit of {torque} {limits[torque]:g} {unit}")

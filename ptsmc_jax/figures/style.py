@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from ptsmc_jax.formulas import ARCSEC
 from ptsmc_jax.scenario.tables import LIMITS, T_F
-from ptsmc_jax.simulation.catalogues import CATALOGUES, as_angle
+from ptsmc_jax.simulation.catalogues import CATALOGUES, TORQUES, as_angle
 
 # colours of Okabe and Ito, distinct for the colour-blind; line styles are distinct in grey
 STYLES = (("#0072B2", "-"), ("#D55E00", "--"), ("#009E73", "-."), ("#000000", ":"), ("#CC79A7", (0, (5, 1, 1, 1))))
@@ -26,7 +26,6 @@ styled = matplotlib.style.context("ptsmc_jax.figures.ptsmc")
 LIMIT: Any = {"color": "0.3", "lw": 1.0, "ls": (0, (6, 3))}  # style of the line of a required limit
 ACTUATOR_LIMIT: Any = {"color": "0.3", "lw": 1.0, "ls": (0, (6, 2, 1, 2))}  # style of the line of an actuator's limit
 LOWER_BOUND: Any = {"color": "0.3", "lw": 1.0, "ls": ":"}  # style of the line of a lower bound
-TORQUES = ("peak_torque", "peak_torque_delivered", "peak_wheel_torque")
 NO_LIMITS: Mapping[str, float] = MappingProxyType({})
 LEGEND_WIDTH = 110  # largest width of a legend below the axes, in characters
 WIDE_RATIO = 1e4  # ratio of an axis's ends above which numbers between powers of ten would overlap
@@ -108,7 +107,7 @@ def metric_display(metric: str, plant: str) -> tuple[Callable[[ArrayLike], np.nd
 
 def torque_metric(limits: Container[str]) -> str:
     """Return the torque metric that figures of many trials show: the first required one, or the commanded torque."""
-    return next((name for name in TORQUES if name in limits), TORQUES[0])
+    return next((name for name in TORQUES if name in limits), "peak_torque")
 
 
 def objective_display(name: str, minimised: str, plant: str) -> tuple[Callable[[ArrayLike], np.ndarray], str]:

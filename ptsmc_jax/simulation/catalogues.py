@@ -37,6 +37,12 @@ POINTING = tuple(pointing.METRICS)
 STATE_CATALOGUE = {name: Entry(*metric.of_states) for name, metric in METRICS.items() if metric.of_states is not None}
 # norms |v| of attitude errors [-], and the metrics with the same errors as angles
 ANGLE_METRICS = {"terminal_error": "terminal_angle", "window_error": "window_angle", "hold_error": "hold_angle"}
+# torque metrics, and their names in tables and figures
+TORQUES = {
+    "peak_torque": "peak commanded torque",
+    "peak_torque_delivered": "peak delivered torque",
+    "peak_wheel_torque": "peak wheel torque",
+}
 MAY_BE_ZERO = ("saturated",)  # metrics that a requirement may limit to zero
 LARGER_IS_BETTER = tuple(f"{WITHIN}{name}" for name in TIME_FRACTION_METRICS)  # all other metrics are better if smaller
 CATALOGUES = {"spacecraft": CATALOGUE, "chain": STATE_CATALOGUE, "system": STATE_CATALOGUE}  # by the kind of the plant

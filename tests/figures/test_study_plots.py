@@ -56,7 +56,7 @@ def test_a_tradeoff_figure_has_each_trial_and_their_rms():
     np.testing.assert_allclose(whole, [arcsec * 13e-6 / np.sqrt(3.0), 0.3], rtol=1e-10)
     said = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
     assert said == [
-        "tuned: RMS 3.1 arcsec, mean peak 0.3 N m",
+        "tuned: RMS 3.1 arcsec, mean peak wheel torque 0.3 N m",
         "limit of peak_wheel_torque 0.5 N m",
         "limit of window_error 4.125 arcsec",
         "lower bound 0.413 arcsec",
@@ -70,6 +70,7 @@ def test_the_first_set_of_a_tradeoff_figure_is_not_hidden_by_a_later_one_at_the_
     (axes,) = study_plots.tradeoff({"tuned": same, "before": same}, {}).axes
     tuned, before = (line for line in axes.lines if ": RMS" in str(line.get_label()))
     assert tuned.get_zorder() > before.get_zorder()
+    assert axes.get_ylabel() == "peak commanded torque [N m]"
 
 
 def test_sensitivities_of_an_error_and_its_angle_are_drawn_once():

@@ -161,6 +161,14 @@ TUNINGS: dict[str, Callable[[], Any]] = {
     "tuned": lambda: tune_report.build(
         examples.tune(held_out=HELD_OUT, published=LOST, verdicts=[examples.torque(0.9)])
     ),
+    "tuned with required metrics": lambda: tune_report.gain_table(
+        examples.tune(
+            held_out={**HELD_OUT, "peak_wheel_torque": errors(5e-3), "ape_boresight": errors(1e-4)},
+            published={**LOST, "peak_wheel_torque": errors(8e-3), "ape_boresight": errors(4e-4)},
+            verdicts=[Requirement(name, 1.0).verdict(np.ones(2), np.ones(2, bool)).in_summary()
+                      for name in ("window_angle", "peak_torque", "peak_wheel_torque", "ape_boresight", "effort")],
+        )
+    ),
     "tuned, a trial of a chain fails": lambda: tune_report.build(
         examples.tune(held_out=HELD_OUT, plant="chain", status="not met")
     ),

@@ -50,7 +50,7 @@ SCENARIO_NOTES = {
 CAPTIONS = {
     "history": "Gains and objective of every starting point over the steps of the local search, as in history.csv. "
     "Each stage has at most tune.steps steps, and may have other trials than the one before.",
-    "tradeoff": "Peak torque and error after t_f of each held-out trial.",
+    "tradeoff": "Torque and error after t_f of each held-out trial; its axis names the torque.",
     "sensitivities": "Change of each metric in per cent for one per cent of each gain.",
     "profiles": "The objective along each gain between its bounds, with the other gains as found; marked points break "
     "a limit.",

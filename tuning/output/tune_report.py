@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Iterator
 from functools import partial
 
-from ptsmc_jax.simulation.catalogues import CATALOGUES, MARGINS, NO_SIGN, percent
+from ptsmc_jax.simulation.catalogues import CATALOGUES, MARGINS, NO_SIGN, TORQUES, percent
 from ptsmc_jax.simulation.requirements import quantity
 from tuning.output import formats, margins_report, report
 from tuning.output.formats import (
@@ -14,6 +14,7 @@ from tuning.output.formats import (
     format_interval,
     format_number,
     format_ratio,
+    in_readable_unit,
     list_counts,
     ratio_to_bound,
 )
@@ -64,8 +65,8 @@ def gain_table(summary: Tune) -> Table:
         if len(set(values)) > 1 and not by_axis:
             rows.append((gain, *(format_number(v, ".6g") for v in values), summary.gain_units.get(base(gain), "-")))
 
-    def add_row(label: str, text: Callable[[Group], str], unit: str = "") -> None:
-        rows.append((label, *map(text, columns.values()), unit))
+    def add_row(label: str, text: Callable[[Group], str]) -> None:
+        rows.append((label, *map(text, columns.values()), ""))
 
     add_row(f"RMS {quantity}", lambda group: format_error(group.number("window_error", "rms"), plant))
     if summary.held_out.lower_bound:
@@ -74,13 +75,14 @@ def gain_table(summary: Tune) -> Table:
             lambda group: format_ratio(ratio_to_bound(group.number("window_error", "rms"), group.lower_bound)),
         )
     add_row("largest RMS error of a trial", lambda group: format_error(group.number("window_error", "max"), plant))
-    for label, metric, statistic in (
-        ("mean peak torque", "peak_torque", "mean"),
-        ("largest peak torque", "peak_torque", "max"),
-        ("mean effort", "effort", "mean"),
-    ):
-        unit = CATALOGUES[plant][metric].unit
-        add_row(label, lambda group, m=metric, s=statistic: format_number(group.number(m, s), ".4g"), unit)
+    statistics = [("mean", "mean", "peak_torque"), ("largest", "max", "peak_torque"), ("mean", "mean", "effort")]
+    shown_errors = ("window_error", "window_angle")
+    required = [v.metric for v in summary.verdicts if v.metric in CATALOGUES[plant] and v.metric not in shown_errors]
+    statistics += [("largest", "max", metric) for metric in required]
+    for word, statistic, metric in dict.fromkeys(statistics):
+        values = [group.number(metric, statistic) for group in columns.values()]
+        unit, values = in_readable_unit(metric, CATALOGUES[plant][metric].unit, *values)
+        rows.append((f"{word} {TORQUES.get(metric, metric)}", *(format_number(v, ".4g") for v in values), unit))
     add_row("failed or not converged", lambda group: str(summary.held_out.trials - group.counts["ok"]))
     note = f"Results on {format_count(summary.held_out.trials, 'held-out trial')} ({summary.judged_on})."
     return Table(("", *columns, "unit"), rows, note)
