@@ -342,7 +342,7 @@ def _add_observer_stage(computer: Board, observer: Observer, device: Actuators) 
         torque_name = "last.wheel_torque"
     elif device.has_dynamics:
         computer.inputs["applied"] = real(m)
-        computer.meanings["applied"] = "mean torque on the body over the last period, from telemetry [N m]"
+        computer.meanings["applied"] = f"mean torque on the body over the last period, from telemetry{computer.unit}"
         torque_name = "in.applied"
     else:
         torque_name = "last.command" if device.is_ideal else "last.torque"
@@ -448,16 +448,18 @@ def _add_actuator_stage(computer: Board, device: Actuators, m: int) -> None:
     wheels = device.wheels
     if device.delay:
         computer.state["queue"] = real(device.delay, m)
-        computer.meanings["queue"] = "delayed commands, the oldest first [N m]"
+        computer.meanings["queue"] = f"delayed commands, the oldest first{computer.unit}"
     if device.has_dynamics:
         computer.inputs.setdefault("acting", real(m))
-        computer.meanings["acting"] = "torque of each axis or wheel at this sample, from telemetry [N m]"
+        computer.meanings["acting"] = f"torque of each axis or wheel at this sample, from telemetry{computer.unit}"
     compensation_note = "" if wheels is None else ", plus the compensation of the wheels' momentum"
     computer.outputs |= {"sent_torque": real(m), "torque": real(m)}
     computer.meanings["sent_torque"] = (
         f"torque to send to the actuators at this sample: `command` within its limit{compensation_note}{computer.unit}"
     )
-    computer.meanings["torque"] = "torque on the body from this sample on, as the flight computer assumes it [N m]"
+    computer.meanings["torque"] = (
+        f"torque on the body from this sample on, as the flight computer assumes it{computer.unit}"
+    )
     if wheels is not None:
         computer.outputs["wheel_torque"] = real(*np.shape(wheels.initial))
         computer.meanings["wheel_torque"] = "torque of each wheel on the body about its axis, from this sample on [N m]"

@@ -15,13 +15,13 @@ import pytest
 
 import ptsmc_jax as ptsmc
 from ptsmc_jax import scenario
-from ptsmc_jax.onboard import folder, templates
+from ptsmc_jax.onboard import folder, generate, templates
 from ptsmc_jax.onboard.board import build_board
 from ptsmc_jax.onboard.library import Library, compiler
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.law_tables import LAWS
 from ptsmc_jax.simulation import rollout
-from tests.helpers import SHORT, fly, short
+from tests.helpers import ROOT, SHORT, fly, short
 from tests.onboard.compiled import CC, STRICT, needs_compiler, step_many
 from tests.onboard.flights import FLIGHTS, flight
 
@@ -316,6 +316,25 @@ def test_exported_c_has_the_names_and_equations_of_the_law(exported):
     ):
         assert line in text
     assert "exponent of the approach phase" in (exported / "ptsmc_short.h").read_text()
+
+
+def test_the_documentation_names_every_file_input_and_output_of_an_export(exported):
+    files = {path.name for path in exported.iterdir()}
+    readme = (exported / "README.md").read_text()
+    assert not [name for name in files - {"README.md"} if f"`{name}`" not in readme]
+    found = {name.replace("_short", "_NAME") for name in files}
+
+    def slow(name, reference_input=False):
+        return {**FLIGHTS[name], "hardware": {**FLIGHTS[name]["hardware"], "torque_lag": 0.1}}, reference_input
+
+    exports = [slow("star tracker out of step"), slow("wheels with lag, limits, delay"), slow("chain", True)]
+    for tables, reference_input in (*exports, (FLIGHTS["raw"], True)):
+        made = build_board(scenario.study(scenario.from_tables(tables)).parts, reference_input)
+        columns = generate.column_names(made)
+        found |= {column.partition("[")[0] for struct in ("in", "out") for column in columns[struct]}
+        assert any("[N m]" in meaning for meaning in made.meanings.values()) == ("plant" not in tables)
+    page = (ROOT / "docs" / "export.md").read_text()
+    assert not [name for name in found if f"`{name}`" not in page]
 
 
 def test_singularity_limit_in_c_equals_that_of_the_simulator(monkeypatch):

@@ -1,5 +1,7 @@
 """Exported C with a sensor suite: replay of the simulation, and missing and invalid readings."""
 
+import re
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from ptsmc_jax.onboard.library import Library
 from ptsmc_jax.simulation.computer import SAMPLE_STATUSES
 from tests.onboard.compiled import needs_compiler, program, replayed, step_many
 from tests.onboard.flights import LAW, LOOP, SPREAD
+from tests.tree import ROOT
 
 
 class Horizon(ptsmc.AttitudeSensor):
@@ -64,6 +67,9 @@ def test_comments_name_the_table_of_each_sensor(suite):
     for place, name in enumerate(("star_tracker_1", "star_tracker_2", "vector_sensor_1", "custom_1")):
         comment = header.rpartition(f" {name}[")[0].rpartition("/*")[2]
         assert f"sensors[{place}]" in comment
+    page = (ROOT / "docs" / "export.md").read_text()
+    documented = {re.sub(r"_\d", "_1", column.partition("[")[0]) for column in library.columns["in"]}
+    assert not [name for name in documented if f"`{name}`" not in page]
 
 
 def test_exported_c_with_a_suite_replays_the_simulation(suite):
