@@ -181,7 +181,7 @@ def field_comments(cls: type) -> dict[str, str]:
             if comment_line:
                 lines_above.append(comment_line[1])
                 continue
-            field = re.match(r"\s+(\w+)\s*:\s*[^#]*?(?:#\s*(.*))?$", text)
+            field = re.match(r"\s+(\w+)\s*:\s*[^#]*?(?:#\s*(?:pyright:[^#]*#?\s*)?(.*))?$", text)
             meaning = (field and field[2]) or " ".join(lines_above)
             if field and meaning and not text.strip().endswith(":"):
                 meanings[field[1]] = meaning.strip()

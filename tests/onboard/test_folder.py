@@ -315,7 +315,9 @@ def test_exported_c_has_the_names_and_equations_of_the_law(exported):
         "const real acceleration_3 = -switching_3",
     ):
         assert line in text
-    assert "exponent of the approach phase" in (exported / "ptsmc_short.h").read_text()
+    header = (exported / "ptsmc_short.h").read_text()
+    assert "exponent of the approach phase" in header
+    assert "/* c of Assumption 1, bound on each component of d' [N m/s] */" in header
 
 
 def test_the_documentation_names_every_file_input_and_output_of_an_export(exported):
