@@ -469,9 +469,13 @@ def _check_torques_match_motion(
         f"the momentum changes by {ratio:.3g} times the impulse of the columns {', '.join(columns)}"
     )
     if fits and likely_unit != unit:
-        raise RefusedError(f'{message}; set telemetry.{key} = "{likely_unit}", which fits, or check spacecraft.inertia')
+        inertia = "telemetry.wheel_inertia and " if wheel_inertia is not None else ""
+        raise RefusedError(
+            f'{message}; set telemetry.{key} = "{likely_unit}", which fits, or check {inertia}spacecraft.inertia'
+        )
     if fits and ratio < 0.0:
         raise RefusedError(f"{message}; check the signs of these columns")
     if abs(np.log(abs(ratio))) > np.log(MAX_TORQUE_RATIO):
         rate_unit = ", telemetry.rate_unit" if rate_t is log.t else ""
-        raise RefusedError(f"{message}; check telemetry.{key}{rate_unit} and spacecraft.inertia")
+        inertia = ", telemetry.wheel_inertia" if wheel_inertia is not None else ""
+        raise RefusedError(f"{message}; check telemetry.{key}{rate_unit}{inertia} and spacecraft.inertia")

@@ -202,7 +202,8 @@ def test_a_large_gyro_bias_is_no_error_of_the_unit():
         ("sent", 1e-3, "check telemetry.torque_unit"),
         ("sent", -1.0, "check the signs"),
         ("speed", 1.0, None),
-        ("speed", 30.0 / np.pi, 'columns speed1, speed2, speed3; set telemetry.speed_unit = "rpm"'),
+        ("speed", 30.0 / np.pi, 'set telemetry.speed_unit = "rpm", which fits, or check telemetry.wheel_inertia'),
+        ("speed", 1e4, "telemetry.wheel_inertia and spacecraft.inertia"),
     ],
 )
 @pytest.mark.parametrize("reading", ["measured_q", "measured_w"])
