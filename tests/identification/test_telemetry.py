@@ -189,6 +189,21 @@ def test_rates_of_a_slow_slew_in_another_unit_are_refused_with_that_unit():
     assert len(telemetry.measurements(loaded(rate_unit="deg/s"), rows).t) >= 390
 
 
+@pytest.mark.parametrize(("unit", "factor"), [("rad/s", 180.0 / np.pi), ("deg/s", 1.0)])
+def test_rates_of_a_slow_slew_at_a_constant_rate_in_another_unit_are_refused(unit, factor):
+    """Regression: a rotation of 15 deg in 25 parts was too small to be compared."""
+    t, rng = np.arange(750) / 5.0, np.random.default_rng(0)
+    rate = np.tile([1.4e-3, 9e-4, -6e-4], (t.size, 1))  # 0.1 deg/s
+    attitude = Rotation.from_rotvec(rate * t[:, None]) * Rotation.from_rotvec(7e-5 * rng.standard_normal(rate.shape))
+    logged = factor * (rate + 1e-4 * rng.standard_normal(rate.shape))
+    columns = {"t": t} | {f"measured_q{k + 1}": attitude.as_quat()[:, k] for k in range(4)}
+    columns |= {f"measured_w{k + 1}": logged[:, k] for k in range(3)} | {f"sent{k + 1}": 0.0 * t for k in range(3)}
+    right = "deg/s" if unit == "rad/s" else "rad/s"
+    with refuses(RefusedError, f'set telemetry.rate_unit = "{right}"'):
+        telemetry.measurements(loaded(rate_unit=unit), pl.DataFrame(columns))
+    assert telemetry.measurements(loaded(rate_unit=right), pl.DataFrame(columns)).t.size > 700
+
+
 def test_a_large_gyro_bias_is_no_error_of_the_unit():
     rows = slow_log(1e-4, 0).with_columns(pl.col(f"measured_w{k}") + 0.02 for k in (1, 2, 3))
     assert len(telemetry.measurements(loaded(), rows).t) >= 390
