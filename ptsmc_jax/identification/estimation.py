@@ -28,11 +28,12 @@ from ptsmc_jax.scenario.identify_tables import Identify
 from ptsmc_jax.scenario.tables import Scenario
 
 ROW_MULTIPLE = 256  # rows of a log are padded to a multiple of it, so that similar logs share compiled programs
-MAX_STEPS = 40  # largest number of steps of a local search
+MAX_EVALUATIONS = 100  # largest number of evaluations of a local search
+MAX_COARSE_EVALUATIONS = 30  # largest number of evaluations of a preliminary search
 MAX_DAMPING = 1e12  # largest damping of a step
 MAX_STEP_LENGTH = 3.0  # longest step of a local search, in sigmas of the prior
-NOISY_TOLERANCE = 0.3  # largest next step that ends a search with noise on the acceleration, in sigmas of the estimate
-STEP_TOLERANCE = 1e-3  # largest next step of a converged search, in sigmas of the estimate
+COARSE_TOLERANCE = 0.3  # largest next step that ends a preliminary search, in sigmas of the estimate
+STEP_TOLERANCE = 1e-2  # largest next step of a converged search, in sigmas of the estimate
 ACCELERATION_NOISES = (0.3, 0.03, 0.003, 0.0003)  # noise in a search, relative to the usual acceleration [s^0.5]
 NOISE_GAIN = 8.0  # smallest gain of the log-likelihood for which noise on the acceleration is kept: 4 sigma
 MIRROR_GAIN = 8.0  # smallest gain of the log-likelihood that tells a phase from its mirrored value
@@ -292,6 +293,8 @@ class Search:
         self.prior_weight = problem.has_prior().astype(float)
         self._noise_is_free = any(parameter.name.endswith("_noise") for parameter in problem.parameters)
         self.acceleration_noise = 0.0  # of the filter [rad/s^1.5]
+        self._start = self._round = ""  # the current part of the search, for the progress
+        self._evaluations = 0  # number of evaluations of the likelihood
         self._jitted_filter = jax.jit(
             lambda z, noise, rows, kind: filtering.run_filter(self._model_at(z, noise), rows, kind),
             static_argnames="kind",
@@ -378,6 +381,7 @@ class Search:
             Log-likelihood, its gradient (n,), and the information (n, n) of logs and prior. Then the mean square of the
             innovations relative to their 1 sigma, averaged over the logs.
         """
+        self._evaluations += 1
         weight, noise, squares = self.prior_weight, jnp.asarray(self.acceleration_noise), []
         value, gradient, information = -0.5 * float(weight @ z**2), -weight * z, np.diag(weight)
         for rows, kind in logs:
@@ -395,23 +399,34 @@ class Search:
             acceleration: see `search_locally`.
             max_starts: largest number of starting points.
         """
+        self._start = f"starting point 1 of at most {max_starts}"
         best, draws = self._mirror_phases(self.search_locally(z, acceleration)), np.random.default_rng(0)
         for k in range(1, max_starts):
             if best.acceleration_noise == 0.0 and best.mean_square < self.largest_mean_square:
                 break
-            self.report(f"starting point {k + 1} of {max_starts}")
+            self._start = f"starting point {k + 1} of at most {max_starts}"
             other = self.search_locally(draws.standard_normal(self.problem.size), acceleration)
+            is_as_likely = abs(other.log_likelihood - best.log_likelihood) < NOISE_GAIN
             if _more_likely(best, other) is other:
                 best = self._mirror_phases(other)
+            if is_as_likely:  # the model is wrong, but not the starting point
+                break
         self.acceleration_noise = best.acceleration_noise
         return best
+
+    def _begin_round(self, text: str) -> None:
+        self._round = text
+        self.report(f"{self._start}, {text}")
 
     def _mirror_phases(self, best: SearchResult) -> SearchResult:
         """Return the best of a search result and of searches from its mirrored phases, see `Problem.mirror_phase`."""
         phases = self.problem.phases
         while phases:
-            self.report("the mirrored phases of the disturbance")
-            others = [self._screen_and_maximise(self.problem.mirror_phase(best.z, k)) for k in phases]
+            others = []
+            for k in phases:
+                self._begin_round(f"mirrored {self.problem.labels[k]}")
+                mirrored = self.problem.mirror_phase(best.z, k)
+                others.append(self._screen_and_maximise(mirrored, 2, COARSE_TOLERANCE))
             if _more_likely(*others).log_likelihood < best.log_likelihood + 1.0:
                 ambiguities = [
                     f"the data do not tell {self.problem.labels[k]} from its mirrored value"
@@ -421,7 +436,7 @@ class Search:
                     > 0.1
                 ]
                 return best._replace(ambiguities=ambiguities)
-            best = _more_likely(*others)
+            best = self._screen_and_maximise(_more_likely(*others).z)
             if self.acceleration_noise > 0.0:  # the phase may have been the only error of the model
                 self.acceleration_noise = 0.0
                 best = _more_likely(best, self._screen_and_maximise(best.z))
@@ -446,15 +461,16 @@ class Search:
             acceleration: usual acceleration in the logs, which scales the noise [rad/s^2]; 0: no noise is added.
         """
         self.acceleration_noise = 0.0
+        self._begin_round("without acceleration noise")
         if acceleration == 0.0 or max(self._relative_median(self.innovations(z, log)) for log in self.logs) < POOR_FIT:
             result = self._screen_and_maximise(z)
             if acceleration == 0.0 or result.mean_square < self.largest_mean_square:
                 return result
         accepted, highest = None, -np.inf
-        for factor in (*ACCELERATION_NOISES, 0.0):
+        for k, factor in enumerate((*ACCELERATION_NOISES, 0.0), 1):
             self.acceleration_noise = factor * acceleration
-            self.report(f"acceleration noise of the filter {self.acceleration_noise:.2g} rad/s^1.5")
-            result = self._screen_and_maximise(z, 1, NOISY_TOLERANCE) if factor else self._screen_and_maximise(z)
+            self._begin_round(f"acceleration noise {k} of {len(ACCELERATION_NOISES) + 1}")
+            result = self._screen_and_maximise(z, 1, COARSE_TOLERANCE) if factor else self._screen_and_maximise(z)
             highest = max(highest, result.log_likelihood)
             if accepted is not None and result.log_likelihood < highest - NOISE_GAIN:
                 self.acceleration_noise = accepted.acceleration_noise
@@ -535,12 +551,10 @@ class Search:
         value, gradient, information, mean_square = start = self.derivatives(z, logs, exact=exact)
         if not _is_finite(start):  # such as an inertia that is too small for the modes, after a random start
             return SearchResult(z, -np.inf, np.zeros_like(information), np.inf, False, 0, self.acceleration_noise)
-        damping, converged, steps = 0.0, False, 0
-        for steps in range(MAX_STEPS + 1):
-            converged = float(gradient @ _newton_step(gradient, information)) < tolerance**2
-            if converged or steps == MAX_STEPS:
-                break
-            while damping < MAX_DAMPING:
+        damping, steps = 0.0, 0
+        end = self._evaluations + (MAX_COARSE_EVALUATIONS if tolerance > STEP_TOLERANCE else MAX_EVALUATIONS)
+        while not (converged := float(gradient @ _newton_step(gradient, information)) < tolerance**2):
+            while damping < MAX_DAMPING and self._evaluations < end:
                 step = _newton_step(gradient, information, damping)
                 candidate = self.derivatives(z + step, logs, exact=exact)
                 if _is_finite(candidate) and candidate[0] < value:  # a narrow curved ridge: return to it
@@ -551,9 +565,12 @@ class Search:
                 damping = max(10.0 * damping, 1.0)
             else:
                 break
-            z, damping = z + step, damping / 100.0
+            z, damping, steps = z + step, damping / 100.0, steps + 1
             value, gradient, information, mean_square = candidate
-            self.report(f"step {steps + 1}: mean square of the innovations {mean_square:.4g}")
+            self.report(
+                f"{self._start}, {self._round}, step {steps}, {self._evaluations} evaluations: mean square of the "
+                f"innovations {mean_square:.4g}"
+            )
         return SearchResult(z, value, information, mean_square, converged, steps, self.acceleration_noise)
 
 

@@ -212,6 +212,7 @@ class ScriptedSearch(estimation.Search):
         )  # fmt: skip
         super().__init__(problem, [], np.inf, lambda text: None)
         self.local, self.mirrored = list(local), list(mirrored)
+        self.tolerances = []
 
     def search_locally(self, z, acceleration):
         result = self.local.pop(0)
@@ -219,6 +220,7 @@ class ScriptedSearch(estimation.Search):
         return result
 
     def _screen_and_maximise(self, z, screenings=1, tolerance=1e-3):
+        self.tolerances.append(tolerance)
         return self.mirrored.pop(0)
 
 
@@ -235,10 +237,44 @@ def test_noise_on_the_acceleration_is_kept_only_for_a_large_gain_of_the_likeliho
 
 def test_phases_of_a_better_starting_point_are_mirrored_too():
     first, second = local_result(0.4, 0.0, mean_square=9.0), local_result(-0.8, 100.0)
-    search = ScriptedSearch([first, second], [local_result(2.7, -1.0), local_result(-2.3, 200.0), second])
+    mirrored = local_result(-2.3, 200.0)
+    search = ScriptedSearch([first, second], [local_result(2.7, -1.0), mirrored, mirrored, second])
     best = search.find_best(np.zeros(1), 1.0, 2)
     assert best.z == -2.3
     assert not best.ambiguities  # the mirrored phase of the first starting point is ambiguous
+
+
+def test_only_a_mirrored_phase_that_is_more_likely_is_searched_with_the_full_accuracy():
+    """Regression: searches from mirrored phases took 90 % of the evaluations of a log of a flexible satellite."""
+    mirrored = local_result(2.7, 100.0)
+    search = ScriptedSearch([local_result(0.4, 0.0)], [mirrored, mirrored, local_result(0.4, 0.0)])
+    assert search.find_best(np.zeros(1), 1.0, 3).z == 2.7
+    assert [tolerance <= estimation.STEP_TOLERANCE for tolerance in search.tolerances] == [False, True, False]
+
+
+def test_a_second_starting_point_that_is_about_as_likely_is_the_last_one():
+    noisy = [local_result(0.4, 100.0, 0.1), local_result(0.4, 97.0, 0.1), local_result(0.4, 500.0)]
+    search = ScriptedSearch(noisy, 3 * [local_result(2.7, 0.0)])
+    assert search.find_best(np.zeros(1), 1.0, 3).log_likelihood == 100.0
+    assert len(search.local) == 1
+
+
+class RuggedSearch(ScriptedSearch):
+    """A search whose likelihood increases at every sixth evaluation only, without end."""
+
+    def derivatives(self, z, logs, *, exact=True):
+        self._evaluations += 1
+        return float(self._evaluations) if self._evaluations % 6 == 1 else -1.0, np.ones(1), np.eye(1), 1.0
+
+
+@pytest.mark.parametrize("tolerance", [estimation.STEP_TOLERANCE, estimation.COARSE_TOLERANCE])
+def test_a_search_ends_after_a_limited_number_of_evaluations(tolerance):
+    """Regression: the number of steps was limited, but not their evaluations. The progress states their number."""
+    search, reports = RuggedSearch([], []), []
+    search.report = reports.append
+    assert not search.maximise_likelihood(np.zeros(1), [], tolerance).converged
+    limit = estimation.MAX_EVALUATIONS if tolerance == estimation.STEP_TOLERANCE else estimation.MAX_COARSE_EVALUATIONS
+    assert limit - 6 < int(reports[-1].split(" evaluations")[0].split()[-1]) <= limit + 2
 
 
 @pytest.mark.parametrize("length", [1, 10, 100])
