@@ -394,23 +394,29 @@ class Search:
     def find_best(self, z: np.ndarray, acceleration: float, max_starts: int) -> SearchResult:
         """Return the best of the local searches from z and, while the fit is poor, from random starting points.
 
+        KeyboardInterrupt after the first local search returns the best completed result, marked as not converged.
+
         Args:
             z: first starting point (n,).
             acceleration: see `search_locally`.
             max_starts: largest number of starting points.
         """
         self._start = f"starting point 1 of at most {max_starts}"
-        best, draws = self._mirror_phases(self.search_locally(z, acceleration)), np.random.default_rng(0)
-        for k in range(1, max_starts):
-            if best.acceleration_noise == 0.0 and best.mean_square < self.largest_mean_square:
-                break
-            self._start = f"starting point {k + 1} of at most {max_starts}"
-            other = self.search_locally(draws.standard_normal(self.problem.size), acceleration)
-            is_as_likely = abs(other.log_likelihood - best.log_likelihood) < NOISE_GAIN
-            if _more_likely(best, other) is other:
-                best = self._mirror_phases(other)
-            if is_as_likely:  # the model is wrong, but not the starting point
-                break
+        best, draws = self.search_locally(z, acceleration), np.random.default_rng(0)
+        try:
+            best = self._mirror_phases(best)
+            for k in range(1, max_starts):
+                if best.acceleration_noise == 0.0 and best.mean_square < self.largest_mean_square:
+                    break
+                self._start = f"starting point {k + 1} of at most {max_starts}"
+                other = self.search_locally(draws.standard_normal(self.problem.size), acceleration)
+                is_as_likely = abs(other.log_likelihood - best.log_likelihood) < NOISE_GAIN
+                if _more_likely(best, other) is other:
+                    best = self._mirror_phases(other)
+                if is_as_likely:  # the model is wrong, but not the starting point
+                    break
+        except KeyboardInterrupt:
+            best = best._replace(converged=False)
         self.acceleration_noise = best.acceleration_noise
         return best
 

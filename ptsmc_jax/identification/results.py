@@ -242,7 +242,7 @@ def verdict(identification: Identification) -> list[str]:
         lines.append(f"the intervals are up to {widening:.3g} times as wide as for white innovations")
     lines += [*_noise_ratios(identification), *_far_estimates(identification)]
     if not identification.converged:
-        lines.append("the search did NOT converge; its estimates are preliminary")
+        lines.append("the search did NOT converge or was interrupted; its estimates are preliminary")
     return [*lines, *identification.undetermined]
 
 

@@ -221,7 +221,10 @@ class ScriptedSearch(estimation.Search):
 
     def _screen_and_maximise(self, z, screenings=1, tolerance=1e-3):
         self.tolerances.append(tolerance)
-        return self.mirrored.pop(0)
+        result = self.mirrored.pop(0)
+        if isinstance(result, BaseException):
+            raise result
+        return result
 
 
 def local_result(phase, log_likelihood, noise=0.0, mean_square=1.0):
@@ -257,6 +260,14 @@ def test_a_second_starting_point_that_is_about_as_likely_is_the_last_one():
     search = ScriptedSearch(noisy, 3 * [local_result(2.7, 0.0)])
     assert search.find_best(np.zeros(1), 1.0, 3).log_likelihood == 100.0
     assert len(search.local) == 1
+
+
+def test_an_interrupted_search_keeps_its_first_result_as_not_converged():
+    """Regression: Ctrl-C discarded all estimates."""
+    search = ScriptedSearch([local_result(0.4, 100.0)], [KeyboardInterrupt()])
+    best = search.find_best(np.zeros(1), 1.0, 3)
+    assert best.z == 0.4
+    assert not best.converged
 
 
 class RuggedSearch(ScriptedSearch):

@@ -25,6 +25,9 @@ def identify(
 
     With --design it proposes the manoeuvre to record instead.
 
+    Ctrl-C in the first local search writes nothing. A later Ctrl-C writes the best estimates so far, marked as not
+    converged.
+
     Exit status: 0 the model explains the logs, and logs and prior knowledge together determine every parameter; 1 not;
     2 configuration error.
 
