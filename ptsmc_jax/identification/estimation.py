@@ -26,6 +26,7 @@ from ptsmc_jax.identification.telemetry import Measurements
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.identify_tables import Identify
 from ptsmc_jax.scenario.tables import Scenario
+from ptsmc_jax.signals import disturbances
 
 ROW_MULTIPLE = 256  # rows of a log are padded to a multiple of it, so that similar logs share compiled programs
 MAX_EVALUATIONS = 100  # largest number of evaluations of a local search
@@ -666,6 +667,23 @@ def describe_undetermined(problem: Problem, information: np.ndarray, by_z: np.nd
     return list(dict.fromkeys(sentences))
 
 
+def _describe_slow_sinusoids(problem: Problem, logs: Sequence[Measurements]) -> list[str]:
+    """Return a sentence if an estimated constant may replace a sinusoid whose period is longer than the logs."""
+    names = {parameter.name for parameter in problem.parameters}
+    largest_frequency = 2.0 * np.pi / max(float(log.t[-1]) for log in logs)
+    is_slow = any(
+        bool(np.any((np.asarray(term.amplitude) != 0.0) & (np.abs(term.frequency) < largest_frequency)))
+        for term in disturbances.terms(problem.model.disturbance)
+        if isinstance(term, disturbances.Sinusoid)
+    )
+    if not is_slow or "disturbance_bias" not in names or parameters.PHASE in names:
+        return []
+    return [
+        "the data do not tell disturbance_bias from the sinusoid of [disturbance], whose period is longer than the "
+        "log: identified.toml has both, and their sum may be too large; free disturbance_phase instead"
+    ]
+
+
 def _build_result(
     loaded: Scenario,
     problem: Problem,
@@ -692,6 +710,7 @@ def _build_result(
         return replace(fit, adjusted=search.innovations(z + step, screened), distance=distance)
 
     fits = [fit_log(log) for log in logs]
+    ambiguities = [*best.ambiguities, *_describe_slow_sinusoids(problem, logs)]
     variance_factor = max(fit.variance_factor for fit in fits)
     z_covariance = inflated_covariance(best.information, np.diag(search.prior_weight), variance_factor)
     return Identification(
@@ -704,9 +723,9 @@ def _build_result(
         covariance=by_z @ z_covariance @ by_z.T,
         undetermined=[
             *describe_undetermined(problem, best.information - np.diag(search.prior_weight), by_start),
-            *best.ambiguities,
+            *ambiguities,
         ],
-        is_determined=determines_all(best.information) and not best.ambiguities,
+        is_determined=determines_all(best.information) and not ambiguities,
         variance_factor=variance_factor,
         fits=fits,
         validation=[fit_log(log, is_validation=True) for log in validation_logs],

@@ -78,6 +78,15 @@ def test_a_doubtful_result_names_dispersed_parameters_that_are_not_free(command,
     assert "free actuator_scale, which [dispersion] varies" in out
 
 
+def test_a_constant_that_may_stand_for_a_slow_sinusoid_is_named(command, logged):
+    """Regression: the identified scenario had the disturbance twice, as a sinusoid and as a constant."""
+    slow = 'kind = "sinusoid"\namplitude = [0.01]\nfrequency = [0.01]'
+    (logged / "slow.toml").write_text(SCENARIO.replace('kind = "none"', slow))
+    status, out, _ = command("identify", "slow.toml", "run/trajectory.csv", "--out", "slow", "--no-figures")
+    assert status == 1
+    assert "the data do not tell disturbance_bias from the sinusoid of [disturbance]" in out
+
+
 def test_a_design_has_a_profile_within_the_limits(command, logged):
     options = "--design", "--duration", "0.1 min", "--rate", "500 mrad/s"
     status, out, err = command("identify", "s.toml", *options, "--out", "plan")
