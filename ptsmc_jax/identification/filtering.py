@@ -168,7 +168,7 @@ def acting_command(model: Model, rows: Rows, wheel_inertia: float | None) -> Arr
 
     impulse = integrate_delayed_command(rows.t + rows.dt) - integrate_delayed_command(rows.t)
     mean = impulse / jnp.where(rows.dt > 0.0, rows.dt, jnp.inf)[:, None]
-    return jnp.where(model.delay > 0.0, mean, rows.command)
+    return jnp.where(model.delay == 0.0, rows.command, mean)
 
 
 class LogKind(NamedTuple):

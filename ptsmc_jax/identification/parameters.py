@@ -340,8 +340,8 @@ def _possible_parameters(
         add(name, unit, kind, get, lambda model, new: paths.put(model, path, new), count)
 
     add_vector("actuator_scale", "-", "factor", "actuators.scale", axes.shape[1])
-    # a delay below 0 has no meaning, and at 0 the derivative would vanish
-    add("delay", "s", "add", lambda m: m.delay, lambda m, new: replace(m, delay=jnp.maximum(new[0], 1e-9)), 1)
+    # within its uncertainty, the estimate of a short delay may be negative; at exactly 0 the derivative would vanish
+    add("delay", "s", "add", lambda m: m.delay, lambda m, new: replace(m, delay=new[0] + 1e-9), 1)
     add(
         "disturbance_bias", plant.input_unit, "add", lambda m: disturbances.bias(m.disturbance, plant.inputs),
         lambda m, new: replace(m, disturbance=disturbances.with_bias(m.disturbance, new)), plant.inputs,

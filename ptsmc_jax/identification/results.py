@@ -62,7 +62,7 @@ def _write_estimate(
         hardware[f"{name}_deg"] = np.rad2deg(rotations).tolist()
         dispersion[name] = {"kind": "normal", "std_deg": float(np.rad2deg(np.max(std)))}
     elif name == "delay":
-        hardware["delay"] = round(numbers[0] / identification.scenario.loop.period)
+        hardware["delay"] = max(0, round(numbers[0] / identification.scenario.loop.period))
     elif name in ("torque_lag", "attitude_noise", "rate_noise"):
         hardware[name] = numbers[0]
         if name == "rate_noise":

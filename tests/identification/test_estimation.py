@@ -451,6 +451,40 @@ def test_a_mode_is_identified_from_a_simulated_run():
     assert damping == max(found.estimate[4], 0.0)  # an estimate of zero may be negative
 
 
+@pytest.mark.long
+def test_parameters_of_actuators_sensors_and_disturbance_are_identified_from_a_simulated_run():
+    hardware = {
+        "torque_lag": 0.2, "delay": 1, "actuator_scale": [1.04, 0.97, 1.02],
+        "actuator_misalignment_deg": [[0.0, 0.5, -0.8], [0.6, 0.0, 0.4], [-0.5, 0.7, 0.0]],
+        "gyro_scale": [1.004, 0.997, 1.002], "star_tracker_misalignment_deg": [0.2, -0.3, 0.1],
+        "attitude_noise": 2e-5, "rate_noise": 3e-5,
+    }  # fmt: skip
+    true: Any = scenario.from_tables({
+        "spacecraft": {"inertia": [3.0, 4.0, 5.0]},
+        "loop": {"mode": "sampled", "period": 0.25, "t_end": 50.0},
+        "initial": {"rotvec_deg": [40.0, -50.0, 30.0], "rate": [0.03, -0.02, 0.04]},
+        "controller": {"t_f": 40.0, "delta": 2.0},
+        "disturbance": {"kind": "sinusoid", "amplitude": [2e-3, 3e-3, 1e-3], "frequency": [0.5, 0.7, 0.9]},
+        "hardware": hardware,
+        "identify": {
+            "free": [*(name.removesuffix("_deg") for name in hardware), "disturbance_amplitude"], "prior": "none",
+        },
+    })  # fmt: skip
+    start = scenario.replace(true, hardware={"torque_lag": 0.1, "attitude_noise": 4e-5, "rate_noise": 2e-5})
+    start = scenario.replace(start, disturbance__amplitude=[1e-3, 1e-3, 1e-3])
+    found = explore.identify(start, explore.simulate(true).to_polars())
+    assert found.is_identified, found.verdict
+    written: Any = found.identified_scenario
+    (delay,) = (index for index, label in enumerate(found.problem.labels) if label == "delay")
+    assert abs(found.estimate[delay] - 0.25) < 3.5 * found.std[delay]
+    for key, value in hardware.items():
+        name = key.removesuffix("_deg")
+        std = max(s for label, s in zip(found.problem.labels, found.std, strict=True) if label.startswith(name))
+        std = np.rad2deg(std) if key.endswith("_deg") else std
+        np.testing.assert_allclose(getattr(written.hardware, key), value, rtol=0.0, atol=3.5 * std + 1e-12)
+    np.testing.assert_allclose(written.disturbance.amplitude, true.disturbance.amplitude, rtol=0.02)
+
+
 def test_noise_of_a_star_tracker_is_about_its_own_axes():
     """A run with a tilted star tracker, whose noise about the boresight is 10 times as large as across it."""
     tables = {

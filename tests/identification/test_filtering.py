@@ -112,6 +112,19 @@ def test_a_linear_gaussian_estimate_is_that_of_generalised_least_squares():
     assert found.is_identified
 
 
+@pytest.mark.parametrize("delays", [(1, 0), (0, 1)])
+def test_a_delay_is_identified_from_a_scenario_without_a_delay_and_the_other_way_round(delays):
+    """Regression: the likelihood had no derivative at delays of zero and below, and the search ended there."""
+    true, start = (
+        scenario.replace(chain(["delay", "disturbance_bias"]), hardware={"state_noise": list(NOISE), "delay": delay})
+        for delay in delays
+    )
+    found = explore.identify(start, explore.simulate(true).to_polars())
+    assert found.is_identified, found.verdict
+    assert abs(found.estimate[0] - 0.1 * delays[0]) < 3.5 * found.std[0] < 0.01
+    assert found.identified_scenario.hardware.delay == delays[0]
+
+
 @pytest.mark.parametrize(("hardware", "sentences"), [({"state_noise": [4e-3, 5e-3]}, 1), ({}, 0)])
 def test_the_verdict_states_the_ratio_of_an_estimated_noise_to_that_of_the_scenario(hardware, sentences):
     """The innovations fit an estimated noise. Without a noise in the scenario, there is nothing to compare."""
