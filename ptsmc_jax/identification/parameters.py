@@ -362,8 +362,9 @@ def _possible_parameters(
         )  # fmt: skip
     quantities: Any = (("amplitude", plant.input_unit, "factor"), ("phase", "rad", "add"))
     for quantity, unit, kind in quantities:
-        count = disturbances.values(model.disturbance, quantity).size
-        if count:
+        values = np.asarray(disturbances.values(model.disturbance, quantity))
+        count = values.size
+        if np.any(values) if kind == "factor" else count:
             add(
                 f"disturbance_{quantity}", unit, kind, lambda m, q=quantity: disturbances.values(m.disturbance, q),
                 lambda m, new, q=quantity: replace(m, disturbance=disturbances.with_values(m.disturbance, q, new)),
@@ -403,7 +404,7 @@ def _number_parameter(
     sigmas: np.ndarray,
     has_prior: bool,
 ) -> Parameter:
-    """Return the parameter of some numbers of a model.
+    """Return the parameter of some numbers of a model. A number of zero is fixed unless a coordinate adds to it.
 
     Args:
         name: name of the parameter.
@@ -426,9 +427,10 @@ def _number_parameter(
         new = start * jnp.exp(c) if kind == "log" else start * (1.0 + c) if kind == "factor" else start + c
         return put(model, new)
 
-    common = None if kind == "add" else 1.0 / sigmas
+    is_free = (np.asarray(start) != 0.0) | (kind == "add")
+    common = None if kind == "add" else 1.0 / sigmas[is_free]
     labels = [name] if count == 1 else [f"{name}_{k + 1}" for k in range(count)]
-    return Parameter(name, labels, unit, np.diag(sigmas), has_prior, write, read, common)
+    return Parameter(name, labels, unit, np.diag(sigmas)[:, is_free], has_prior, write, read, common)
 
 
 def _leaf_parameter(path: str, model: Model, place: int, leaf: ArrayLike) -> Parameter:

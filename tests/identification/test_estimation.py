@@ -171,6 +171,23 @@ def test_dispersed_phases_are_estimated_by_default_and_not_confused_with_their_m
     assert written.dispersion.disturbance_phase is None
 
 
+def test_an_amplitude_of_zero_is_fixed_and_does_not_change_the_verdict():
+    """Regression: two amplitudes of zero were undetermined, and the sentence named the first amplitude."""
+    term = {"kind": "sinusoid", "amplitude": [0.5 * TORQUE, 0.0, 0.0], "frequency": 3 * [FREQUENCY]}
+    names = ("disturbance_amplitude", "disturbance_bias")
+    loaded = satellite(names, disturbance=term, spacecraft={"inertia": TRUE.tolist()})
+    (frame, _) = flight(
+        np.random.default_rng(7), disturbance=lambda t: TORQUE * np.array([np.sin(FREQUENCY * t), 0.0, 0.0])
+    )
+    found = explore.identify(loaded, frame)
+    assert found.is_identified, found.verdict
+    assert abs(found.estimate[0] - TORQUE) < 3.5 * found.std[0] < 0.05 * TORQUE
+    np.testing.assert_array_equal([found.estimate[1:3], found.std[1:3]], 0.0)
+    none = scenario.replace(loaded, disturbance__amplitude=[0.0, 0.0, 0.0])
+    with pytest.raises(ScenarioError, match=r"identify.free has disturbance_amplitude, which this scenario does not"):
+        explore.identify(none, frame)
+
+
 def test_only_phases_of_sinusoids_are_mirrored(disturbed):
     """Phases p and p + pi of a gravity gradient have the same torque, and p + pi is no mirror image."""
     terms = [{"kind": "gravity_gradient"}, DISPERSED["disturbance"]]
