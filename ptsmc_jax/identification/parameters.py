@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.tree_util import keystr, tree_flatten_with_path
+from jax.tree_util import FlattenedIndexKey, keystr, tree_flatten_with_path
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
@@ -386,7 +386,8 @@ def _possible_parameters(
         possible["mode_coupling"] = lambda: _coupling_parameter(model, *prior_sigma("mode_coupling", 1))
     if not model.is_spacecraft:  # the numbers inside a custom plant
         for k, (key_path, leaf) in enumerate(tree_flatten_with_path(plant)[0]):
-            path = "plant" + keystr(key_path)
+            # the argument 0 of a `jax.tree_util.Partial` H is plant.H[0], its argument drag is plant.H['drag']
+            path = "plant" + keystr(tuple(key for key in key_path if not isinstance(key, FlattenedIndexKey)))
             if not path.startswith(("plant.inertia", "plant.z0")):
                 possible.setdefault(path, lambda path=path, k=k, leaf=leaf: _leaf_parameter(path, model, k, leaf))
     if isinstance(getattr(scenario, "sensors", None), SensorSuite):

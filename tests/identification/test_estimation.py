@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ptsmc_jax import explore, formulas, scenario
+from ptsmc_jax import explore, formulas, plants, scenario
 from ptsmc_jax.dispersions import numbers
 from ptsmc_jax.dispersions.quantities import PAIRS
 from ptsmc_jax.identification import estimation, filtering, parameters, results, telemetry
@@ -500,6 +500,28 @@ def test_parameters_of_actuators_sensors_and_disturbance_are_identified_from_a_s
         std = np.rad2deg(std) if key.endswith("_deg") else std
         np.testing.assert_allclose(getattr(written.hardware, key), value, rtol=0.0, atol=3.5 * std + 1e-12)
     np.testing.assert_allclose(written.disturbance.amplitude, true.disturbance.amplitude, rtol=0.02)
+
+
+def test_numbers_of_a_custom_plant_are_identified_and_named_by_function_and_argument():
+    def acceleration(stiffness, t, x_1, x_2, drag):
+        return -stiffness * jnp.sin(x_1) - drag * x_2
+
+    def pendulum(stiffness, drag):
+        numbers = jax.tree_util.Partial(acceleration, jnp.asarray(stiffness), drag=jnp.asarray(drag))
+        system = plants.system(1, lambda t, x_1, x_2: x_2, numbers, lambda t, x_1, x_2: jnp.eye(1) / 0.5)
+        return scenario.from_tables({
+            "plant": {"kind": "system", "system": system, "x0": [1.0, 0.0]},
+            "controller": {"t_f": 4.0},
+            "disturbance": {"kind": "none"},
+            "loop": {"mode": "sampled", "period": 0.05},
+            "hardware": {"state_noise": [1e-3, 1e-3]},
+            "identify": {"free": ["plant.H[0]", "plant.H['drag']"], "prior": "none"},
+        })  # fmt: skip
+
+    found = explore.identify(pendulum(8.0, 0.2), explore.simulate(pendulum(9.81, 0.1)).to_polars())
+    assert found.is_identified, found.verdict
+    assert np.all(np.abs(found.estimate - [9.81, 0.1]) < 3.5 * found.std)
+    assert np.all(found.std < [0.01, 0.01])
 
 
 def test_noise_of_a_star_tracker_is_about_its_own_axes():
