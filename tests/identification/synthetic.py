@@ -27,7 +27,7 @@ def small(turn):
 def logs(
     rng, inertia, count=1, *, dt=0.1, rows=600, torque=1e-3, slews=3, wheels=False, scale=(1.0, 1.0, 1.0), lag=0.0,
     star=5e-5, gyro=1.4e-4, bias=1e-4, walk=0.0, rate=(0.0, 0.0, 0.0),
-    disturbance=lambda t: np.zeros(3),
+    disturbance=lambda t: np.zeros(3), command=None,
 ):  # fmt: skip
     """Return frames with the columns of `trajectory.csv`, and the true gyro bias of each at its end [rad/s].
 
@@ -52,13 +52,15 @@ def logs(
         walk: density of the walk of its bias [rad/s/sqrt(s)].
         rate: body rate at the start [rad/s].
         disturbance: time [s] -> torque (3,) [N m].
+        command: torque (rows, 3) of all logs instead of the slews [N m].
     """
     t, inverse = dt * np.arange(rows), np.linalg.inv(inertia)
     axes = rng.standard_normal((count, slews, 3))
     axes /= np.max(np.abs(axes), axis=2, keepdims=True)
     length = t[-1] / slews
     place = np.minimum((t / length).astype(int), slews - 1)
-    command = torque * axes[:, place] * np.sin(2.0 * np.pi * (t - place * length) / length)[:, None]
+    slew_torque = torque * axes[:, place] * np.sin(2.0 * np.pi * (t - place * length) / length)[:, None]
+    command = slew_torque if command is None else np.tile(command, (count, 1, 1))
     q, w, h = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), np.tile(rate, (count, 1)), np.zeros((count, 3))
     v = np.zeros((count, 3))
     drift = bias * rng.standard_normal((count, 3))

@@ -12,7 +12,7 @@ import pytest
 from ptsmc_jax import explore, formulas, plants, scenario
 from ptsmc_jax.dispersions import numbers
 from ptsmc_jax.dispersions.quantities import PAIRS
-from ptsmc_jax.identification import estimation, filtering, parameters, results, telemetry
+from ptsmc_jax.identification import design, estimation, filtering, parameters, results, telemetry
 from ptsmc_jax.scenario import parsing
 from ptsmc_jax.scenario.errors import ScenarioError
 from tests.identification import synthetic
@@ -335,6 +335,28 @@ def test_the_search_converges_if_a_log_hardly_determines_some_moments():
     assert found.is_identified, found.verdict
     true = np.array([0.05, 0.0, 0.0, 0.09, 0.0, 0.11])
     assert np.all(np.abs(found.estimate - true) < 3.5 * found.std)
+
+
+@pytest.mark.long
+def test_a_proposed_manoeuvre_is_within_the_limits_and_as_accurate_as_expected():
+    limits = {"torque_limit": 2e-3, "momentum_limit": 4e-3}
+    loaded = satellite(spacecraft={"inertia": TRUE.tolist()}, wheels={"kind": "axes", **limits})
+    proposed = design.design(loaded, 60.0, rate=0.05)
+    command = proposed.frame.select("^sent.$").to_numpy()
+    momentum = 0.25 * np.cumsum(command, axis=0)
+    rate = np.max(np.abs(proposed.frame.select("^measured_w.$").to_numpy()))
+    ratios = np.array([np.max(np.abs(command)) / 2e-3, np.max(np.abs(momentum)) / 4e-3, rate / 0.05])
+    assert 0.9 < np.max(ratios) <= 1.0
+    assert np.max(np.abs(momentum[-1])) < 1e-12  # from rest to rest
+    assert np.linalg.norm(proposed.std) < np.linalg.norm(proposed.plain_std)
+    (frame,), _ = synthetic.logs(
+        np.random.default_rng(1), TRUE, dt=0.25, rows=241, wheels=True, lag=0.05, command=command
+    )
+    start = satellite(telemetry={"wheel_torque": ["sent1", "sent2", "sent3"]})
+    found = explore.identify(start, frame)
+    assert found.is_identified, found.verdict
+    np.testing.assert_allclose(found.std, proposed.std, rtol=0.1)
+    assert np.all(np.abs(found.estimate - ENTRIES) < 3.5 * proposed.std)
 
 
 def test_fast_rotation_is_integrated_accurately():
