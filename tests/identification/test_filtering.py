@@ -159,6 +159,33 @@ def test_the_gradient_of_the_likelihood_agrees_with_finite_differences():
     assert np.linalg.eigvalsh(information)[0] > 0.0
 
 
+@pytest.mark.long
+def test_the_gradient_for_a_flexible_spacecraft_agrees_with_finite_differences():
+    names = ["inertia", "gyro_scale", "star_tracker_misalignment", "attitude_noise", "torque_lag", "mode_frequency"]
+    inertia = np.array([[0.05, 0.002, -0.001], [0.002, 0.09, 0.003], [-0.001, 0.003, 0.11]])
+    (frame,), _ = synthetic.logs(np.random.default_rng(3), inertia, dt=0.25, rows=100, wheels=True, lag=0.05)
+    loaded = scenario.from_tables({
+        "spacecraft": {"inertia": inertia.tolist()},
+        "flexible": {"frequency": [3.0], "damping": [0.01], "coupling": [[0.05, 0.0, 0.02]]},
+        "loop": {"mode": "sampled", "period": 0.25},
+        "disturbance": {"kind": "none"},
+        "hardware": {"attitude_noise": 5e-5, "rate_noise": 1.4e-4, "torque_lag": 0.05},
+        "wheels": {"kind": "axes"},
+        "identify": {"free": [*names, "gyro_bias"], "prior": "none"},
+    })  # fmt: skip
+    problem, log = prepared(loaded, frame)
+    search = estimation.Search(problem, [log], np.inf, lambda text: None)
+    z = 0.1 * np.random.default_rng(1).standard_normal(problem.size)
+    _, gradient, _, _ = search.derivatives(z, search.logs)
+    step = 1e-5
+    differences = []
+    for one in step * np.eye(problem.size):
+        high, low = (search.log_likelihood(z + sign * one) for sign in (1.0, -1.0))
+        differences.append((high - low) / (2.0 * step))
+    # the log-likelihood is about 1e8, so that the differences have rounding errors of 1e-16 * 1e8 / step = 1e-3
+    np.testing.assert_allclose(gradient, differences, rtol=1e-6, atol=1e-9 * np.max(np.abs(gradient)))
+
+
 def test_the_likelihood_does_not_jump_if_a_reading_is_rejected():
     """Regression: a rejected reading did not count, and the gain or loss depended on the unit of the readings."""
     problem, (rows, kind) = prepared(chain(["actuator_scale"]), chain_log(bias=0.0)[0])
