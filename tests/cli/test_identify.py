@@ -69,6 +69,17 @@ def test_a_simulated_run_gives_its_parameters_and_a_page(command, logged):
     assert "actuator_scale" in (folder / "report.html").read_text()
 
 
+@pytest.mark.long
+def test_a_replayed_trial_gives_its_parameters(command, logged):
+    text = (logged / "true.toml").read_text() + "[dispersion]\nx0 = { kind = 'uniform', half_width = [0.2, 0.1] }\n"
+    (logged / "true.toml").write_text(text)
+    assert command("montecarlo", "true.toml", "--trials", 2, "--out", "campaign", "--no-figures", "--quiet")[0] == 0
+    assert command("replay", "campaign", "--trial", 1, "--out", "trial", "--no-figures", "--quiet")[0] == 0
+    assert command("identify", "s.toml", "trial/trajectory.csv", "--out", "found", "--no-figures")[0] == 0
+    scale = json.loads((logged / "found" / "summary.json").read_text())["parameters"][0]
+    assert abs(scale["estimate"] - 1.25) < 3.5 * scale["std"] < 0.02
+
+
 def test_a_doubtful_result_names_dispersed_parameters_that_are_not_free(command, logged):
     """The log has 1.25 times the torque of the scenario, and no free parameter explains it."""
     text = SCENARIO.replace('["actuator_scale", "disturbance_bias"]', '["disturbance_bias"]')
@@ -120,7 +131,10 @@ def test_a_design_names_parameters_that_are_known_better_than_the_manoeuvre_can_
         (["--design", "--rate", "2 m/s"], "for --rate: 2 m/s is no number in rad/s or with a unit such as"),
         (["absent.csv"], "the log is absent.csv, which does not exist; allowed is a .csv or .parquet file"),
         (["s.toml"], "the log is s.toml, but must be a .csv or .parquet file"),
+        (["twice.csv"], "twice.csv has t 0.5 in row 6, but must have a time after that of row 5, 0.5"),
     ],
 )
 def test_wrong_options_and_files_are_refused_and_nothing_is_written(command, tmp_path, options, words):
+    rows = [f"{0.1 * min(k, 5 + k // 7):.1f},1,0,0" for k in range(20)]
+    (tmp_path / "twice.csv").write_text("\n".join(["t,measured_x1,measured_x2,sent1", *rows]))
     assert words in refused(command, tmp_path, "identify", "s.toml", *options)
