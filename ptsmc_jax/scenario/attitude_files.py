@@ -69,7 +69,7 @@ def _read_version(
     start_epoch = None if epoch is None else epochs.parse_key(epoch)
     if path.suffix.lower() in (".csv", ".parquet"):
         times, quaternions, rates = _read_table(path, order, direction, start_epoch)
-        usable_until = float(times[-1])
+        usable_until = np.inf
     else:
         for key, value in (("quaternion_order", order), ("direction", direction)):
             if value is not None:
@@ -80,7 +80,7 @@ def _read_version(
             raise ValueError("which is no text in UTF-8; allowed are .csv, .parquet and AEM files (KVN)") from None
         segment = aem.read_segment(text, start_epoch, any_interpolation=interpolation == "spline")
         times, quaternions, rates, usable_until = segment
-    return _check_samples(times, quaternions, rates, min(usable_until, float(times[-1])))
+    return _check_samples(times, quaternions, rates, usable_until)
 
 
 def _check_samples(
@@ -118,7 +118,7 @@ def _check_samples(
             raise ValueError(f"sample {k + 1}: its rate differs from the derivative of its quaternions by "
                              f"{errors[k]:.3g} rad/s; rates are body rates in rad/s, in an AEM in deg/s")  # fmt: skip
     acceleration = (np.linalg.norm(np.diff(all_rates, axis=0), axis=1) / steps).max()
-    return Samples(times, q, end_rates, usable_until, float(largest + np.sqrt(acceleration)))
+    return Samples(times, q, end_rates, min(usable_until, float(times[-1])), float(largest + np.sqrt(acceleration)))
 
 
 def _read_table(

@@ -160,7 +160,8 @@ REFUSED = {
         "rate differs",
     ),
     "half a segment": (message(Q).split("META_STOP")[0], "no complete segment"),
-    "empty": (message(Q[:1], dates=DATES[:1]), "1 samples"),
+    "one attitude": (message(Q[:1], dates=DATES[:1]), "1 samples"),
+    "no data": (message(Q[:0], dates=[]), "0 samples"),
 }  # fmt: skip
 
 
@@ -179,6 +180,7 @@ BROKEN = {
     "an empty cell": (GOOD.with_columns(pl.when(pl.col("t") == 2.5).then(None).otherwise("q2").alias("q2")), "row"),
     "no column": (GOOD.drop("q3"), "no quaternion"),
     "no time": (GOOD.drop("t"), "no column of times"),
+    "no rows": (GOOD.clear(), "0 samples"),
     "repeated time": (GOOD.with_columns(t=pl.Series([0.0, 1.0, 1.0, 2.0, 3.0])), "sample 3"),
     "norm": (GOOD.with_columns(q4=pl.col("q4") * 1.1), "norm"),
     "large turns": (
