@@ -219,7 +219,10 @@ def _rotate_to_body(quaternions: np.ndarray, vectors: np.ndarray) -> np.ndarray:
 
 
 def format_message(name: str, times: np.ndarray, quaternions: np.ndarray, rates: np.ndarray, epoch: str | None) -> str:
-    """Return a message (version 1.0) with attitudes and rates of a spacecraft.
+    """Return a message (version 1.0) with the attitudes of a spacecraft and their derivatives.
+
+    Derivatives of quaternions are unambiguous. Other programs read the rates of QUATERNION/RATE as derivatives of Euler
+    angles, and issue 2 of the standard has removed this attitude type.
 
     Args:
         name: name of the spacecraft.
@@ -238,7 +241,7 @@ def format_message(name: str, times: np.ndarray, quaternions: np.ndarray, rates:
         "ORIGINATOR = PTSMC-JAX",
         "META_START",
         *epoch_comment,
-        "COMMENT Quaternion from body to inertial axes, in the order Q1 Q2 Q3 QC, then body rates in deg/s.",
+        "COMMENT Quaternion from body to inertial axes, in the order Q1 Q2 Q3 QC, then its derivative in 1/s.",
         f"OBJECT_NAME = {name}",
         "OBJECT_ID = 0000-000A",
         "CENTER_NAME = EARTH",
@@ -248,13 +251,12 @@ def format_message(name: str, times: np.ndarray, quaternions: np.ndarray, rates:
         "TIME_SYSTEM = UTC",
         f"START_TIME = {begin}",
         f"STOP_TIME = {end}",
-        "ATTITUDE_TYPE = QUATERNION/RATE",
+        "ATTITUDE_TYPE = QUATERNION/DERIVATIVE",
         "QUATERNION_TYPE = LAST",
-        "RATE_FRAME = REF_FRAME_B",
         "META_STOP",
         "DATA_START",
     ]
-    numbers = np.column_stack([quaternions, np.rad2deg(rates)]).tolist()
+    numbers = np.hstack([quaternions, references.quaternion_rates(quaternions, rates)]).tolist()
     rows = [
         f"{start_epoch.after(float(t))} {' '.join(map(repr, row))}"
         for t, row in zip(times.tolist(), numbers, strict=True)

@@ -265,7 +265,7 @@ def _spline_rates(times: np.ndarray, samples: np.ndarray, ends: np.ndarray | Non
         )
         slopes = [KroghInterpolator(*side).derivative(side[0][0]) for side in sides]
     else:
-        slopes = [_quaternion_rate(samples[k], ends[k]) for k in (0, -1)]
+        slopes = quaternion_rates(samples[[0, -1]], ends)
     return CubicSpline(times, samples, bc_type=[(1, slope) for slope in slopes])(times, 1)
 
 
@@ -286,9 +286,10 @@ def body_rates(q: np.ndarray, q_dot: np.ndarray) -> np.ndarray:
     return 2.0 * (s * v_dot - s_dot * v - np.cross(v, v_dot))
 
 
-def _quaternion_rate(q: np.ndarray, w: np.ndarray) -> np.ndarray:
-    """Return the time derivative (4,) [1/s] of a quaternion (4,) for the rate w (3,) [rad/s] in body axes."""
-    return 0.5 * np.append(q[3] * w + np.cross(q[:3], w), -np.dot(q[:3], w))
+def quaternion_rates(q: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """Return the time derivatives (n, 4) [1/s] of quaternions (n, 4) for the rates w (n, 3) [rad/s] in body axes."""
+    v, s = q[:, :3], q[:, 3:]
+    return 0.5 * np.hstack([s * w + np.cross(v, w), -np.sum(v * w, axis=1, keepdims=True)])
 
 
 def with_continuous_signs(quaternions: np.ndarray) -> np.ndarray:

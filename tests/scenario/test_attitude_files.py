@@ -223,10 +223,23 @@ def test_written_messages_are_read_back_with_equal_numbers(tmp_path):
     found = aem.read_segment(text)
     assert found.rates is not None
     np.testing.assert_array_equal(found.quaternions, S)
-    np.testing.assert_allclose(found.rates, rates, rtol=1e-15)
+    np.testing.assert_allclose(found.rates, rates, rtol=0, atol=1e-16)
     np.testing.assert_allclose(found.times, TIMES, atol=1e-12)
     assert "QUATERNION_TYPE = LAST" in text
     assert found.usable_until == TIMES[-1]
+
+
+def test_an_independent_package_reads_the_same_numbers_of_written_messages():
+    """CCSDS-NDM reads quaternions, their derivatives and times."""
+    ndm_io = pytest.importorskip("ccsds_ndm.ndm_io")
+    text = aem.format_message("SAT", TIMES, S, np.deg2rad(RATE), "2026-03-20T23:59:58")
+    states = [row.quaternion_derivative for row in ndm_io.NdmIo().from_string(text).body.segment[0].data.attitude_state]
+    q = np.array([[row.quaternion.q1, row.quaternion.q2, row.quaternion.q3, row.quaternion.qc] for row in states])
+    slopes = (row.quaternion_rate for row in states)
+    q_dot = [[one.q1_dot.value, one.q2_dot.value, one.q3_dot.value, one.qc_dot.value] for one in slopes]
+    np.testing.assert_array_equal(q, S)
+    np.testing.assert_allclose(q_dot, SLOPE, rtol=0, atol=1e-16)
+    assert [row.epoch for row in states] == DATES
 
 
 @pytest.mark.parametrize("text", ["2026-03-20T12:00:00", "2026-03-20T12:00:00.000000000125Z", "2024-366T23:59:59.5"])
