@@ -257,16 +257,17 @@ def test_unusable_inputs_return_a_warning_and_the_last_command(loop):
     assert found == rows[-1][1] | {"status": 4}
 
 
+@pytest.mark.parametrize("version", fmu_files.VERSIONS)
 @pytest.mark.parametrize("model", [pytest.param("controller", marks=pytest.mark.long), "plant"])
-def test_sanitizers_find_nothing(rich, tmp_path, model):
+def test_sanitizers_find_nothing(rich, tmp_path, model, version):
     made = {"controller": folder.controller_model, "plant": folder.plant_model}[model](rich)
-    texts, token = fmu_files.source_texts(made, 3)
+    texts, token = fmu_files.source_texts(made, version)
     for name, text in texts.items():
         (tmp_path / name).write_text(text)
     driver = str(ROOT / "tests" / "onboard" / "fmu_driver.c")
     strict = [flag for flag in STRICT if flag != "-Wconversion"]
     names = [str(tmp_path / name) for name in texts if name.endswith(".c")]
-    flags = ["-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    flags = [f"-DVERSION={version}", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
     built = [*compiler(), *strict, *flags, *names, driver, "-o", str(tmp_path / "driver"), "-lm"]
     done = subprocess.run(built, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
