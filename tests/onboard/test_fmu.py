@@ -177,19 +177,31 @@ def test_saved_and_restored_states_replay_to_the_last_bit(loop):
 
 
 def test_two_instances_are_independent(loop):
-    _, plant = loop
+    """Second instances of both FMUs, for another trial, do not change the results of the first ones."""
+    controller, plant = loop
     alone = run(loop, 2, 10)
-    other = plant.instance()
-    plant.unit.reset()
+    other_controller, other_plant = (one.instance() for one in loop)
+    for one in loop:
+        one.unit.reset()
     plant.begin({"seed": SEED, "trial": 2})
-    plant.begin({"seed": SEED, "trial": 9}, other)
+    plant.begin({"seed": SEED, "trial": 9}, other_plant)
+    inputs, starts = controller.names("input"), [n for n in controller.names("parameter") if n in alone[0][0]]
+    controller.begin({name: alone[0][0][name] for name in starts})
+    controller.begin(plant.read(starts, other_plant), other_controller)
     for k, (readings, commands) in enumerate(alone):
         assert plant.read(list(readings)) == readings
-        assert plant.read(["true_attitude[1]"], other)["true_attitude[1]"] != readings["true_attitude[1]"]
+        assert plant.read(["true_attitude[1]"], other_plant)["true_attitude[1]"] != readings["true_attitude[1]"]
+        controller.write({name: readings[name] for name in inputs})
+        controller.write(plant.read(inputs, other_plant), other_controller)
+        controller.step(k)
+        controller.step(k, other_controller)
+        assert controller.read(list(commands)) == commands
+        assert controller.read(["command[1]"], other_controller)["command[1]"] != commands["command[1]"]
         plant.write({name: commands[name] for name in plant.names("input")})
         plant.step(k)
-        plant.step(k, other)
-    other.terminate()
+        plant.step(k, other_plant)
+    other_controller.terminate()
+    other_plant.terminate()
 
 
 def test_shorter_communication_steps_give_the_same_samples(loop):
