@@ -13,6 +13,7 @@ import pytest
 
 import ptsmc_jax as ptsmc
 from ptsmc_jax import scenario
+from ptsmc_jax.campaigns import store
 from ptsmc_jax.onboard import fmu as fmu_files
 from ptsmc_jax.onboard import folder
 from ptsmc_jax.onboard.library import Library, compiler
@@ -129,13 +130,14 @@ def test_closed_loop_of_fmus_equals_the_simulation(rich, expected, loop):
         assert all(commands["status"] in (0, 1) for _, commands in rows)
 
 
-def test_controller_has_the_outputs_of_the_exported_c(library, loop):
-    controller, _ = loop
-    rows, state, columns = run(loop, 3), library.initial_state(), library.columns
+def assert_outputs_of_the_c(library, controller, rows):
+    """Assert that a controller FMU has returned the outputs and statuses of the exported C, to the last bit."""
+    state, columns = library.initial_state(), library.columns
     for name, value in rows[0][0].items():
         if name.startswith("initial_"):
-            element = name.removeprefix("initial_").replace("[", " ").replace("]", "").split()
-            state[columns["state"].index(f"{element[0]}[{int(element[1]) - 1}]")] = value
+            element, *places = re.split(r"\W", name.removeprefix("initial_").rstrip("]"))
+            element += "".join(f"[{int(place) - 1}]" for place in places)
+            state[columns["state"].index(element)] = value
     inputs = controller.names("input")
     for k, (readings, commands) in enumerate(rows):
         given = [k * controller.period, *(readings[name] for name in inputs)]
@@ -143,6 +145,10 @@ def test_controller_has_the_outputs_of_the_exported_c(library, loop):
         found = np.array([v for name, v in commands.items() if name != "status"])
         assert found.tobytes() == out.tobytes()
         assert status == commands["status"]
+
+
+def test_controller_has_the_outputs_of_the_exported_c(library, loop):
+    assert_outputs_of_the_c(library, loop[0], run(loop, 3))
 
 
 def test_saved_and_restored_states_replay_to_the_last_bit(loop):
@@ -349,13 +355,17 @@ RANDOM = {**FLIGHTS["slew"], "dispersion": {"reference": {"kind": "normal", "std
     ("name", "count"), [*((name, 1000) for name in SIX), *((name, 100) for name in OTHERS), ("random reference", 5)]
 )
 def test_closed_loops_of_other_scenarios_equal_the_simulation(name, count, tmp_path):
-    """The plant supplies a random reference to the controller."""
+    """The controller also equals the exported C. The plant supplies a random reference to the controller."""
     supplied = name == "random reference"
     made, version = made_from({**FLIGHTS, "suite": TABLES, "random reference": RANDOM}[name], supplied), 3 - supplied
     fmus = folder.Fmus(controller=True, plant=True, version=version)
     fmus.write(tmp_path, made)
+    store.write_folder(tmp_path / "c", lambda making: folder.write_program(making, made))
+    library = Library(tmp_path / "c")
     loop = tuple(Unit(tmp_path / f"{one}_fmi{version}.fmu") for one in ("controller", "plant"))
     expected = simulated(made, SEED, range(count))
     for trial in range(count):
-        found = of_plant(made, run(loop, trial))  # 1e-10: rounding of exp and log, amplified by the gains
+        rows = run(loop, trial)
+        assert_outputs_of_the_c(library, loop[0], rows)
+        found = of_plant(made, rows)  # 1e-10: rounding of exp and log, amplified by the gains
         np.testing.assert_allclose(found, expected[trial, :SAMPLES], rtol=0.0, atol=1e-10, err_msg=f"trial {trial}")
