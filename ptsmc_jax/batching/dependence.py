@@ -170,7 +170,7 @@ def while_dependence(
 
 
 def branch_dependence(branches: Sequence, index: int, operands: Sequence[int]) -> list[int]:
-    """Return the flags of the outputs of a `cond` or `switch`.
+    """Return the flags of the outputs of a `cond` or `switch`: integers with one bit for each input or batch axis.
 
     Args:
         branches: closed jaxprs of the branches.

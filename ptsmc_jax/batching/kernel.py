@@ -117,12 +117,16 @@ def scan(
 
 
 def _next_power_of_two(length: int) -> int:
-    """Return the next power of two, which Triton requires of shapes."""
+    """Return the smallest power of two that is at least `length`. Triton requires powers of two in shapes."""
     return 1 << (length - 1).bit_length()
 
 
 def _table_dtype(dtype: Any) -> str:
-    """Return the dtype of the table that holds numbers of this dtype."""
+    """Return the dtype of the table for values of this dtype: int32 for booleans, otherwise the dtype itself.
+
+    Raises:
+        NotImplementedError: A kernel has no values of this dtype.
+    """
     if str(dtype) not in _DTYPES:
         raise NotImplementedError(f"a kernel cannot hold values of the type {dtype}")
     return "int32" if dtype == np.dtype(bool) else str(dtype)
@@ -185,9 +189,10 @@ class _Tables:
         """Append an array to the table of its dtype, and return its place there. An empty array creates no table.
 
         Args:
-            parts: the entries: one array of numbers, or a row for each component. Empty: the places are only reserved.
-            size: number of entries.
-            shape: shape of the array.
+            parts: in a table of numbers, one flat array (size,). In a table of rows, a row over the trials for each
+                component. If it is empty, the place is only reserved.
+            size: number of table entries of the array: numbers for all directions, or rows for one direction.
+            shape: shape of the array in one direction.
             dtype: dtype of the array.
             stride: see `_StoredArray`.
         """

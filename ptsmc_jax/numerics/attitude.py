@@ -161,7 +161,7 @@ def rotation_vector(v: Vector) -> Vector:
 
 
 def small_rotation(q: Quaternion, other: Quaternion) -> Vector:
-    """Return the small rotation [rad] in body axes from one attitude to another, to first order."""
+    """Return the small rotation [rad] from attitude q to attitude `other`, in body axes of q, to first order."""
     error = multiply(conjugate(q), other)
     return jnp.where(error[3] < 0.0, -2.0, 2.0) * error[:3]
 
