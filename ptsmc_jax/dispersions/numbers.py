@@ -191,7 +191,7 @@ class RelativeInertia:
     drawn: ClassVar[draws.Distribution] = "normal"
     count: ClassVar[int] = 3 * CANDIDATES + 3 + 4 * SLENDER_CANDIDATES
 
-    def at(self, c: Float[Array, " n"]) -> tuple[Float[Array, "3 3"], Float[Array, "3 3"]]:
+    def at(self, c: Float[Array, " count"]) -> tuple[Float[Array, "3 3"], Float[Array, "3 3"]]:
         """Return the inertia [kg m^2] and its inverse, (3, 3) each, for standard normal numbers c (count,) [-]."""
         plain, rotation, slender_c = jnp.split(c, (3 * CANDIDATES, 3 * CANDIDATES + 3))
         candidates = plain.reshape(CANDIDATES, 3), jnp.ones(CANDIDATES, dtype=bool)

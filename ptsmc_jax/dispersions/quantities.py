@@ -78,6 +78,7 @@ def with_body(parts: Parts, body: Spacecraft) -> Parts:
 
 
 def _with_inertia(parts: Parts, entries: Numbers) -> Parts:
+    """Return the parts with the true inertia of these entries (6,) [kg m^2], in the order of `PAIRS`."""
     inertia = jnp.stack([jnp.stack([entries[k] for k in row]) for row in _PAIR_INDICES])
     return with_body(parts, paths.get(parts, "plant").with_inertia(inertia, matrices.solve(inertia, jnp.eye(3))))
 

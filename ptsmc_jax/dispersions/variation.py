@@ -73,7 +73,7 @@ class Dispersion:
         return kinds if self.custom is None else {**kinds, CUSTOM: self.custom}
 
     def coordinates(self, seed: WholeNumber, trial: WholeNumber) -> Coordinates:
-        """Return the coordinates [-] of a trial. Each quantity has its own stream, independent of the others.
+        """Return the coordinates [-] of a trial by quantity. The random streams of the quantities are independent.
 
         Args:
             seed: seed of the campaign [-].
@@ -138,7 +138,7 @@ class Row(NamedTuple):
 
 
 class TrialSetup(NamedTuple):
-    """Everything that determines the parts of a trial."""
+    """Nominal parts, dispersion, seed and number of one trial. They determine the parts of the trial."""
 
     parts: Parts  # nominal parts, with the given values of the row
     dispersion: Dispersion  # of the quantities that are not given

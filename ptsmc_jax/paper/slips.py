@@ -37,7 +37,10 @@ class Slip:
 
 
 def slips(cases: dict[str, Run]) -> list[Slip]:
-    """Return each error with its evidence; cases: as `claims.simulate_cases` returns them."""
+    """Return the errors and gaps of the paper with their numerical evidence.
+
+    cases: the runs that `claims.simulate_cases` returns, by the name of the case.
+    """
     return [
         _show_expansion_coefficients(),
         _show_factor_of_theorem_3(),
@@ -203,7 +206,7 @@ def _show_effective_gain() -> Slip:
 @pytree
 @dataclass(frozen=True)
 class _Unaligned(AdditiveKinematics):
-    """The error as printed in the paper, without a choice of the sign of q."""
+    """The attitude error as printed in the paper, without a choice of the sign of q."""
 
     def align(self, x: rigid_body.AttitudeState, target: Target) -> rigid_body.AttitudeState:
         return x
