@@ -308,8 +308,9 @@ class Search:
         )
         self._jitted_derivatives = jax.jit(self._differentiate, static_argnames=("kind", "exact"))
 
-    def _model_at(self, z: Array, noise: Array) -> Model:
-        return replace(self.problem.model_at(z), acceleration_noise=noise)
+    def _model_at(self, z: Array, acceleration_noise: Array) -> Model:
+        """Return the model at coordinates (n,), with noise on the acceleration in the filter [rad/s^1.5]."""
+        return replace(self.problem.model_at(z), acceleration_noise=acceleration_noise)
 
     def _differentiate(
         self, z: Array, noise: Array, rows: Rows, kind: LogKind, exact: bool

@@ -298,7 +298,7 @@ def _hidden_sigma(plant: Any, logs: Sequence[Measurements]) -> Array:
 def _possible_parameters(
     scenario: Scenario, model: Model, logs: Sequence[Measurements], log_interval: float, prior: object
 ) -> dict[str, Callable[[], Parameter]]:
-    """Return a function that makes each parameter of the scenario, by name.
+    """Return a factory for each parameter that the scenario has, by the name of the parameter.
 
     log_interval: time between two rows of the first log [s], the default prior 1 sigma of a delay.
     """

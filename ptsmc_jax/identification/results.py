@@ -105,7 +105,7 @@ def _write_disturbance(
         name: estimated parameter, such as "disturbance_amplitude".
         numbers: the estimates.
         std: 1 sigma of the estimates.
-        relative: dispersion of an amplitude, a table with a kind.
+        relative: entry of [dispersion] if the parameter is an amplitude, see `_relative_dispersion`.
         identification: its scenario has the number of phases and amplitudes of each term.
     """
     table = dict(tables.get("disturbance", {}))
@@ -174,6 +174,7 @@ def summary(identification: Identification) -> dict[str, Any]:
 
 
 def _summarise_fit(fit: Fit) -> dict[str, object]:
+    """Return the entry of `summary.json` about the fit of one log."""
     names = component_names(fit)
     rms = np.sqrt(np.nanmean(np.where(fit.innovations.accepted, fit.innovations.value, np.nan) ** 2, axis=0))
     largest = np.max(np.abs(fit.autocorrelation()), axis=0)
