@@ -325,32 +325,33 @@ def everything(delta=0.93, **changes):
     return dataclasses.replace(run, sensors=sensing, actuators=device, disturbance=total, walk_rate=vector([1e-4] * 3))
 
 
-def error_with_everything(eta, delta, gain):
+def window_error_with_every_device(eta, delta, gain):
+    """Return the window error of a noisy run with every device and these gains of law and observer."""
     run = with_controller(everything(), eta=eta, delta=delta)
     run = dataclasses.replace(run, observer=dataclasses.replace(run.observer, gain=jnp.full(3, gain)))
     return rollout.simulate(run, 3, 5).metrics.window_error
 
 
 @programs.jit
-def sloped_with_everything(gains, along):
-    """The error and its derivative along a direction of eta, delta and the observer's gain."""
-    return jax.jvp(lambda gains: error_with_everything(*gains), (gains,), (along,))
+def window_error_and_derivative(gains, along):
+    """Return the window error and its derivative along a direction of eta, delta and the observer's gain."""
+    return jax.jvp(lambda gains: window_error_with_every_device(*gains), (gains,), (along,))
 
 
 def test_gradients_with_every_device_equal_finite_differences():
     point = np.array([3.2, 0.93, 30.0])
     for k, along in enumerate(np.eye(3)):
-        slope = sloped_with_everything(point, along)[1]
+        slope = window_error_and_derivative(point, along)[1]
         assert np.isfinite(slope)
         h = 2e-5 * point[k] * along  # large enough to average over the quantisation of 1e-13 N m
-        up, down = (sloped_with_everything(at, along)[0] for at in (point + h, point - h))
+        up, down = (window_error_and_derivative(at, along)[0] for at in (point + h, point - h))
         np.testing.assert_allclose(slope, (up - down) / (2 * h[k]), rtol=1e-4)
 
 
 def test_error_is_continuous_where_delta_is_a_multiple_of_the_period():
     """The run has delay, filter and random walk. A first period of length 0 has no weight."""
     gains = (np.array([3.2, 1.0 + shift, 30.0]) for shift in (-1e-7, 1e-7))
-    below, above = (sloped_with_everything(at, np.eye(3)[1])[0] for at in gains)
+    below, above = (window_error_and_derivative(at, np.eye(3)[1])[0] for at in gains)
     np.testing.assert_allclose(below, above, rtol=1e-4)
 
 

@@ -204,7 +204,7 @@ def test_noise_density_gives_the_deviation_of_a_sample():
         np.testing.assert_allclose(sigma * period * np.sqrt(100.0 / period), 1e-5 * np.sqrt(100.0), rtol=1e-12)
 
 
-def test_best_bandwidth_depends_on_the_information_per_time():
+def test_best_bandwidth_of_the_attitude_filter_depends_on_the_information_per_time():
     """Half the noise with four times the interval gives the same information, for star tracker and gyro."""
     best = formulas.best_bandwidth(2e-5, 1e-6, 0.1, 0.4)
     assert best == pytest.approx(1e-6 / 2e-5 / 2.0, rel=1e-12)

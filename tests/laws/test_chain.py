@@ -120,14 +120,15 @@ def test_continuous_chain_equals_exact_solution_2(n, t_f):
         run = chain_parts(x0, t_f, eta, 0.01 * t_f)
         log = fly(run).log
         before = log.t < 0.99 * t_f * (1 - 1e-12)
-        exact = exact_motion(run, log.t[before])
+        exact = exact_chain_motion(run, log.t[before])
         largest = np.abs(exact.x).max()
         np.testing.assert_allclose(log.x[before], exact.x, rtol=0, atol=1e-9 * largest)
         np.testing.assert_allclose(log.s[before, 0], exact.s, rtol=0, atol=1e-9 * np.abs(exact.s).max())
 
 
 @jax.jit
-def exact_motion(run, t):
+def exact_chain_motion(run, t):
+    """Return the exact motion of a chain without disturbance at times (times,) before t_f."""
     law = run.controller
     return jax.vmap(lambda time: solutions.exact_chain(time, law.t_f, law.eta, run.initial))(t)
 

@@ -88,6 +88,7 @@ def quintic(start, rate, t, t_f=T_F):
 
 
 def phi(x, q, settling):
+    """Return Phi of the predefined-time law. From any start, x' = -Phi(x) reaches 0 within `settling`."""
     return np.pi / (2.0 * q * settling) * (sig(x, 1.0 + q) + sig(x, 1.0 - q))
 
 

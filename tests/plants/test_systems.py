@@ -283,7 +283,7 @@ def test_keys_of_a_system_must_have_its_size(changes, said):
 
 
 def test_systems_from_python_and_from_files_survive_replace(tmp_path: Path):
-    made = one()
+    made = one_coordinate()
     tables = {"plant": {"kind": "system", "system": made, "x0": [0.1, 0.0]}}
     changed = scenario.study(scenario.replace(scenario.from_tables(tables), controller__eta=4.0))
     assert changed.parts.plant is made
@@ -299,11 +299,12 @@ def study(system, x0, **tables):
     return scenario.study(scenario.from_tables({"plant": {"kind": "system", "system": system, "x0": x0}, **tables}))
 
 
-def one(F=lambda t, a, b: b, H=lambda t, a, b: 0 * a, G=lambda t, a, b: jnp.eye(1), D=None):
+def one_coordinate(F=lambda t, a, b: b, H=lambda t, a, b: 0 * a, G=lambda t, a, b: jnp.eye(1), D=None):
+    """Return the custom system of one coordinate with these functions; see `second_order.system`."""
     return second_order.system(1, F, H, G, D)
 
 
-FAST = [one(H=lambda t, a, b: -60 * b), one(H=lambda t, a, b: -2500 * a)]
+FAST = [one_coordinate(H=lambda t, a, b: -60 * b), one_coordinate(H=lambda t, a, b: -2500 * a)]
 
 
 @pytest.mark.parametrize("system", short(FAST, FAST[1:]))
@@ -314,12 +315,12 @@ def test_steps_follow_the_fast_modes_of_a_plant(system):
     for name in ("window_error", "peak_torque"):
         np.testing.assert_allclose(getattr(ours.metrics, name), getattr(finer_steps.metrics, name), rtol=1e-3)
     with pytest.raises(ScenarioError, match=r"^plant\.system is too fast.*would take more than 200 integration"):
-        study(one(H=lambda t, a, b: -1e4 * b), [1.0, 0.0], **loop)
+        study(one_coordinate(H=lambda t, a, b: -1e4 * b), [1.0, 0.0], **loop)
 
 
 @pytest.mark.parametrize("w", short([10.0, 20.0], [20.0]))
 def test_steps_follow_the_explicit_time_of_a_system(w):
-    system = one(F=lambda t, a, b: b - jnp.cos(w * t))
+    system = one_coordinate(F=lambda t, a, b: b - jnp.cos(w * t))
     tables = {"controller": {"t_f": 30.0, "disturbance_bound": 0.0}}
     run = study(system, [1.0, 0.0], **tables).parts
     ours, theirs = (rollout.simulate_parts(one).metrics for one in (run, finer(run, 4)))  # no history: many steps
@@ -330,7 +331,7 @@ def test_sign_width_that_needs_too_many_steps_later_in_the_run_is_refused():
     """The gain D of the disturbance grows from 1 to 100. For D = 1, this sign width is allowed."""
     steep = {"controller": {"disturbance_bound": 1.0, "sign_width": 1e-2}}
     with pytest.raises(ScenarioError, match=r"^controller\.sign_width is 0\.01, but must be larger"):
-        study(one(D=lambda t, a, b: jnp.eye(1) * (1 + 99 * jnp.tanh(t))), [1.0, 0.0], **steep)
+        study(one_coordinate(D=lambda t, a, b: jnp.eye(1) * (1 + 99 * jnp.tanh(t))), [1.0, 0.0], **steep)
 
 
 # inputs in different units, and a disturbance on one of two inputs
@@ -348,7 +349,7 @@ BOTH = second_order.system(2, lambda t, a, b: b, lambda t, a, b: 0 * a, lambda t
     ("system", "x0", "mode", "singular"),
     [
         pytest.param(BOTH, [1.0, 0.2, 0.0, 0.0], "sampled", True, marks=pytest.mark.long),
-        (one(G=lambda t, a, b: jnp.reshape((a - 0.5) ** 2, (1, 1))), [1.0, 0.0], "continuous", True),
+        (one_coordinate(G=lambda t, a, b: jnp.reshape((a - 0.5) ** 2, (1, 1))), [1.0, 0.0], "continuous", True),
         (HALF, [1.0, 0.2, 0.0, 0.0], "continuous", False),
     ],
 )
@@ -359,7 +360,7 @@ def test_singularity_is_relative_to_the_start_in_any_units(system, x0, mode, sin
 
 def test_a_singular_matrix_at_the_start_is_refused_by_name():
     with pytest.raises(ScenarioError, match=r"^plant\.system has a singular dF/dx2 G at t = 0 in plant\.x0"):
-        study(one(G=lambda t, a, b: jnp.zeros((1, 1))), [1.0, 0.0])
+        study(one_coordinate(G=lambda t, a, b: jnp.zeros((1, 1))), [1.0, 0.0])
     with pytest.raises(ScenarioError, match=r'singular D .*observer\.kind = "nonlinear" must invert; .*"none"$'):
         study(HALF, [1.0, 0.0, 0.0, 0.0], observer={"kind": "nonlinear"})
 
@@ -376,13 +377,13 @@ def test_a_singular_matrix_at_the_start_is_refused_by_name():
 )
 def test_functions_that_are_not_finite_at_the_start_are_refused_by_name(changes, said):
     with pytest.raises(ScenarioError, match=f"^{re.escape(f'plant.system has {said} at t = 0 in plant.x0; allowed')}"):
-        study(one(**changes), [1.0, 0.0])
+        study(one_coordinate(**changes), [1.0, 0.0])
 
 
 def test_a_hidden_state_of_a_truth_that_is_not_finite_at_the_start_is_refused():
     late = {"H": lambda t, a, b, z: 0 * a, "Z": lambda t, a, b, z, u: u / b, "z0": [0.0]}
     truth = second_order.system(1, lambda t, a, b: b, G=lambda t, a, b: jnp.eye(1), **late)
-    tables = {"kind": "system", "system": one(), "truth": truth, "x0": [1.0, 0.0]}
+    tables = {"kind": "system", "system": one_coordinate(), "truth": truth, "x0": [1.0, 0.0]}
     with pytest.raises(ScenarioError, match=r"^plant\.truth has Z = \[nan\] at t = 0 in plant\.x0; allowed are finite"):
         scenario.study(scenario.from_tables({"plant": tables}))
 

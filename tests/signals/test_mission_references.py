@@ -29,7 +29,8 @@ SUN = {"loop": {"epoch": "2026-06-01T06:00:00"}}
 TOLERANCE = 1e-9  # rad, rad/s; rounding of angles that grow to 10 rad is 1e-14
 
 
-def built(table, orbit=ORBIT, **others):
+def build_reference(table, orbit=ORBIT, **others):
+    """Return the reference of a scenario with this table [reference] and orbit."""
     read: Any = scenario.from_tables({"orbit": orbit, "reference": table, **MULTIPLICATIVE, **others})
     return read.reference.build(read)
 
@@ -109,7 +110,7 @@ CASES = {
 
 @pytest.mark.parametrize(("table", "first", "second"), CASES.values(), ids=CASES)
 def test_attitude_and_rate_equal_those_of_vectors(table, first, second):
-    reference = built({**table, **AXES}, loop={"t_end": 7000.0})
+    reference = build_reference({**table, **AXES}, loop={"t_end": 7000.0})
     times = np.linspace(0.0, 7000.0, 57)  # more than one revolution
     targets = lapack.vmap(reference)(jnp.asarray(times))
     for t, q, w in zip(times, np.asarray(targets.q), np.asarray(targets.w), strict=True):
@@ -121,7 +122,7 @@ def test_attitude_and_rate_equal_those_of_vectors(table, first, second):
 
 @pytest.mark.parametrize("table", [case[0] for case in CASES.values()], ids=CASES)
 def test_quaternion_is_continuous_and_consistent_with_rate_and_acceleration(table):
-    reference = built({**table, **AXES}, loop={"t_end": 7000.0})
+    reference = build_reference({**table, **AXES}, loop={"t_end": 7000.0})
     step = 1.0
     times = np.arange(0.0, 7000.0, step)
     targets = lapack.vmap(reference)(jnp.asarray(times))
@@ -140,7 +141,7 @@ def test_quaternion_is_continuous_and_consistent_with_rate_and_acceleration(tabl
 
 def test_nadir_turns_with_the_orbit_and_points_down():
     circle = {"semi_major_axis": 6.9e6, "inclination": 0.5}
-    reference = built({"kind": "nadir"}, circle)
+    reference = build_reference({"kind": "nadir"}, circle)
     target, place = reference(jnp.asarray(321.0)), reference.orbit(jnp.asarray(321.0))
     np.testing.assert_allclose(target.w, [0.0, -np.sqrt(MU / 6.9e6**3), 0.0], atol=1e-15)
     np.testing.assert_allclose(target.w_dot, np.zeros(3), atol=1e-15)
@@ -152,10 +153,12 @@ def test_nadir_and_ground_target_equal_those_of_basilisk():
     recorded = json.loads((Path(__file__).parent / "basilisk_references.json").read_text())
     orbit, times = recorded["orbit"] | {"earth_angle": 0.0}, jnp.asarray(recorded["times"])
     hill = {"kind": "nadir", "primary_axis": [-1, 0, 0], "secondary_axis": [0, 1, 0]}  # axes of the Hill frame
-    target = lapack.vmap(built(hill, orbit))(times)
+    target = lapack.vmap(build_reference(hill, orbit))(times)
     x, y, z = recorded["point"]
     place = {"latitude": np.arctan2(z, np.hypot(x, y)), "longitude": np.arctan2(y, x), "height": 0.0}
-    ground = built({"kind": "ground_target", "primary_axis": [0, 0.6, 0.8], **place}, orbit, loop={"t_end": 6000.0})
+    ground = build_reference(
+        {"kind": "ground_target", "primary_axis": [0, 0.6, 0.8], **place}, orbit, loop={"t_end": 6000.0}
+    )
     ground = replace(ground, primary=orbits.GroundPoint(jnp.asarray(recorded["point"])))
     pointed = lapack.vmap(ground)(times)
     for k, row in enumerate(recorded["rows"]):
@@ -194,7 +197,7 @@ def test_gravity_gradient_is_that_of_the_orbit_and_within_its_bounds():
 
 @pytest.mark.parametrize("eccentricity", [0.0, 0.3, 0.9])
 def test_kepler_equation_and_its_derivatives(eccentricity):
-    orbit = built({"kind": "nadir"}, ORBIT | {"eccentricity": eccentricity}).orbit
+    orbit = build_reference({"kind": "nadir"}, ORBIT | {"eccentricity": eccentricity}).orbit
     times = np.linspace(0.0, 20_000.0, 401)
     e, p = eccentricity, 7.2e6 * (1.0 - eccentricity**2)
     places = lapack.vmap(orbit)(jnp.asarray(times))
@@ -228,7 +231,7 @@ def test_earth_angle_of_the_epoch():
 
 
 def test_reference_in_lanes_equals_the_single_one():
-    reference = built({"kind": "ground_target", **TARGET}, loop={"t_end": 900.0})
+    reference = build_reference({"kind": "ground_target", **TARGET}, loop={"t_end": 900.0})
     times = jnp.asarray(np.linspace(0.0, 900.0, 7))
     batched, single = lanes.vmap(reference)(times), [reference(t) for t in times]
     for name in ("q", "w", "w_dot"):

@@ -43,7 +43,7 @@ def test_rounding_does_not_move_the_end_of_an_anchored_clock(period, t_f, delta,
 
 
 @pytest.mark.parametrize("periods", [10, 20])
-def test_anchored_ticks_are_continuous_at_multiples_of_the_period(periods):
+def test_anchored_ticks_are_continuous_in_delta_at_multiples_of_the_period(periods):
     anchored = clock.anchored_clock(0.1, 15.0)
 
     def ends(delta):

@@ -225,7 +225,7 @@ def test_parts_and_results_print_short_lines():
     assert {"  t_end: float64 ()", "  window: key<fry> ()"} <= set(repr(given).splitlines())
 
 
-def test_scenarios_and_studies_print_their_tables():
+def test_repr_of_scenarios_and_studies_lists_their_tables():
     shown = repr(FLIGHT).splitlines()
     assert shown[0] == "SpacecraftScenario"
     assert any(line.startswith("  controller: PrescribedTime(t_f=30.0, ") for line in shown)

@@ -153,7 +153,7 @@ def test_filter_covariance_stays_at_its_initial_steady_state():
 
 
 @pytest.mark.parametrize("delay", [0, 1, 2, 3])
-def test_propagated_state_has_the_dynamics_of_the_closed_loop(delay):
+def test_covariance_is_propagated_with_the_dynamics_of_the_closed_loop(delay):
     """The loop has random matrices and delayed commands. A constant torque is an additional state."""
     rng, (n, k, m) = np.random.default_rng(delay), (6, 4, 3)
     shapes = (n, n), (n, k), (1, n, m), (m, n), (m, k), (n, m)

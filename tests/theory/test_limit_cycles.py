@@ -20,7 +20,8 @@ CHAIN = {
 }
 
 
-def swing(**changes):
+def find_limit_cycle(**changes):
+    """Return the limit cycle of the chain with these changes of its scenario, or None if it has none."""
     return limit_cycles.find(scenario.study(scenario.replace(scenario.from_tables(CHAIN), **changes)).parts)
 
 
@@ -31,7 +32,7 @@ def test_limit_cycle_of_a_narrow_sign_has_the_closed_form(k1):
     Here a = h K / (2 - h K1). The peak-to-peak command is 2 (K + K1 a), with a relative error of about c h / 2, because
     v changes within a period.
     """
-    found = swing(controller__k1=k1, controller__sign_width=1e-7)
+    found = find_limit_cycle(controller__k1=k1, controller__sign_width=1e-7)
     assert found is not None
     a = H * K / (2.0 - H * k1)
     np.testing.assert_allclose(found.size, 2.0 * (K + k1 * a), rtol=C * H)
@@ -55,17 +56,17 @@ def test_size_of_a_slow_limit_cycle_is_peak_to_peak(delay):
 def test_limit_cycle_begins_at_the_width_of_an_unstable_boundary_layer(share, swings):
     """The pole 1 - h (K1 + K / width), neglecting c h, is -1 for width = h K / (2 - h K1)."""
     border = H * K / (2.0 - H)
-    assert (swing(controller__sign_width=share * border) is not None) == swings
+    assert (find_limit_cycle(controller__sign_width=share * border) is not None) == swings
 
 
 def test_a_linear_oscillation_is_not_a_limit_cycle():
     """With K1 h = 1.98 the sign of s alternates and |s| decays by 2 % per period, inside a wide boundary layer."""
-    assert swing(controller__k1=1.98 / H, controller__sign_width=10.0) is None
+    assert find_limit_cycle(controller__k1=1.98 / H, controller__sign_width=10.0) is None
 
 
 def test_no_limit_cycle_for_a_discontinuous_sign_or_a_short_hold_phase():
-    assert swing(controller__sign_width=0.0) is None
-    assert swing(controller__sign_width=1e-7, loop__t_end=4.2, loop__window=0.1) is None
+    assert find_limit_cycle(controller__sign_width=0.0) is None
+    assert find_limit_cycle(controller__sign_width=1e-7, loop__t_end=4.2, loop__window=0.1) is None
 
 
 @pytest.mark.parametrize(("whole", "judged"), [(15, False), (16, True)])
