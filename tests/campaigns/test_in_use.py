@@ -84,7 +84,7 @@ def test_a_temporary_folder_stays_while_another_process_shares_the_lock(tmp_path
     assert tree(folder) == {"a": b"kept"}
 
 
-def test_a_file_system_without_locks_is_written_to(tmp_path, monkeypatch):
+def test_results_are_written_to_a_file_system_without_locks(tmp_path, monkeypatch):
     def unsupported(*_):
         raise OSError(95, "Operation not supported")
 

@@ -70,8 +70,8 @@ def simulated(made, seed, trials):
     return np.asarray(jax.jit(jax.vmap(run))(jnp.asarray(trials, jnp.uint32)))
 
 
-def of_plant(made, rows):
-    """The same values of a closed loop of FMUs, (samples, n)."""
+def true_states(made, rows):
+    """Return the true states in the columns of `simulated`, from the rows of a closed loop of FMUs, (samples, n)."""
     names = [*sorted(made.ready.parts.plant.signals), "disturbance"]
     columns = [name for one in names for name in rows[0][0] if name.partition("[")[0] == f"true_{one}"]
     return np.array([[readings[name] for name in columns] for readings, _ in rows])
@@ -126,7 +126,7 @@ def test_closed_loop_of_fmus_equals_the_simulation(rich, expected, loop):
     assert not np.allclose(expected[0], expected[1])
     for k, trial in enumerate((0, 3)):
         rows = run(loop, trial)
-        np.testing.assert_allclose(of_plant(rich, rows), expected[k, :SAMPLES], rtol=0.0, atol=1e-10)
+        np.testing.assert_allclose(true_states(rich, rows), expected[k, :SAMPLES], rtol=0.0, atol=1e-10)
         assert all(commands["status"] in (0, 1) for _, commands in rows)
 
 
@@ -322,7 +322,7 @@ class Unwritable(ptsmc.Disturbance):
     """A disturbance with an operation that C does not have."""
 
     def __call__(self, t, x):
-        """Return a torque (3,) [N m]."""
+        """Return a torque (3,) [N m] from a singular value decomposition, which C does not have."""
         return 1e-3 * jnp.linalg.svd(jnp.outer(x.w, x.w) + jnp.eye(3))[1]
 
 
@@ -367,5 +367,5 @@ def test_closed_loops_of_other_scenarios_equal_the_simulation(name, count, tmp_p
     for trial in range(count):
         rows = run(loop, trial)
         assert_outputs_of_the_c(library, loop[0], rows)
-        found = of_plant(made, rows)  # 1e-10: rounding of exp and log, amplified by the gains
+        found = true_states(made, rows)  # 1e-10: rounding of exp and log, amplified by the gains
         np.testing.assert_allclose(found, expected[trial, :SAMPLES], rtol=0.0, atol=1e-10, err_msg=f"trial {trial}")

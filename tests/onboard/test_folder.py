@@ -40,6 +40,7 @@ QUICK = "CFLAGS=-O0"  # for builds that another test compiles with optimisation
 
 
 def make(place, *args):
+    """Run make in a folder with these arguments, and return the finished process."""
     environment = {
         name: value for name, value in os.environ.items() if name not in ("MAKEFLAGS", "MFLAGS", "MAKELEVEL")
     }

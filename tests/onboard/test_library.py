@@ -402,13 +402,13 @@ def test_parameters_that_a_trial_changes_are_passed_to_c(name, exported):
 
 @pytree
 @dataclass(frozen=True)
-class Apart(ptsmc.Draw):
-    """A draw that changes the inertia in one place only."""
+class InconsistentInertia(ptsmc.Draw):
+    """A dispersion that changes the inertia of either law or observer (`where`), or only the inverse of both ("")."""
 
     where: str = field(metadata={"static": True})
 
     def at(self, c, parts):
-        """The parts with another inertia in one part, or with another inverse only."""
+        """Return the parts with the changed inertia, for a random number c (1,) [-]."""
         part, factor = getattr(parts, self.where or "controller"), 1.0 + 0.1 * c[0]
         changed = {"inertia": part.model.inertia * factor} if self.where else {}
         model = replace(part.model, inertia_inverse=part.model.inertia_inverse / factor, **changed)
@@ -426,7 +426,7 @@ def test_a_draw_that_changes_one_of_several_shared_parameters_raises_an_error(wh
     """C has one inertia for law and observer, so that it cannot use different values."""
     made, library = exported("delay, limit, quantised")
     with pytest.raises(ScenarioError, match=r"dispersion\.custom changes .*inertia.* alone, but the controller in"):
-        InTheLoop(library, made.ready.parts, Dispersion(custom=Apart(where)))
+        InTheLoop(library, made.ready.parts, Dispersion(custom=InconsistentInertia(where)))
 
 
 @needs_compiler

@@ -23,7 +23,7 @@ class Horizon(ptsmc.AttitudeSensor):
     scale: float = ptsmc.number(1.0, above=0.0, meaning="of both", unit="-")
 
     def read(self, q):
-        """Two components [-] of the sensor's axes along inertial z."""
+        """Return the components [-] of the sensor's z and x axes along inertial z, times `scale`."""
         axes = attitude.multiply(q, self.mounting)
         along = [attitude.rotate(axes, jnp.eye(3)[k])[2] for k in (2, 0)]
         return self.scale * jnp.stack(along)

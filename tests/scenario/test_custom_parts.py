@@ -62,7 +62,7 @@ def places(tmp_path_factory):
 
 @pytest.fixture
 def home(command, places, monkeypatch):
-    """The current folder, with a campaign whose scenario and metrics name my.py. The marker of my.py is removed.
+    """The current folder, with a campaign whose scenario and metrics name my.py. `ran` is False in it.
 
     The campaign runs once, and its folder is restored for each test, because results name files by their path.
     """

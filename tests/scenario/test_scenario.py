@@ -351,7 +351,7 @@ def test_the_clock_covers_the_reach_of_the_gains(mode):
     ],
     ids=str,
 )
-def test_an_impossible_reach_is_refused(farther, refused):
+def test_a_reach_with_an_impossible_range_is_refused(farther, refused):
     with pytest.raises(ValueError, match=f"^{re.escape(refused)}$"):
         reach_of(from_tables({"loop": {"mode": "sampled"}}), **farther)
 

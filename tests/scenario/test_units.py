@@ -163,7 +163,7 @@ def test_a_slew_of_ten_milliseconds_is_accepted():
     assert quick.loop.window == pytest.approx(0.01 / 30.0)
 
 
-def test_overflowing_defaults_are_refused():
+def test_a_t_f_whose_default_times_overflow_is_refused():
     with pytest.raises(ScenarioError, match=r"controller\.t_f"):
         from_tables({"controller": {"t_f": 1e300}})
 

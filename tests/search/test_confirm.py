@@ -45,8 +45,11 @@ def test_allowed_is_the_largest_count_with_a_sure_verdict(requirement):
     assert most < (1.0 - requirement.quantile) * trials  # fewer than the fraction itself, because the verdict is random
 
 
-def test_a_quantile_limit_applies_to_the_training_trials_or_to_a_band():
-    """A quantile of 99 % with 95 % confidence allows no violation in 299 trials, so a search needs more trials."""
+def test_a_quantile_limit_applies_to_a_band_if_there_are_too_few_training_trials():
+    """99 % of the trials with 95 % confidence allow no violation in 299 trials. A search needs twice as many trials.
+
+    With fewer training trials the limit applies to a band: the confirmation trials that are closest to the limit.
+    """
     every = Requirement("peak_torque", 0.5)
     assert confirm.allowed_in_training(every, [every], 64) == (None, False)
     assert confirm.allowed_in_training(SEEN, [SEEN], 64) == (6, False)  # ceil(0.9 * 64) = 58 trials must keep it

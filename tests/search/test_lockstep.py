@@ -37,7 +37,7 @@ def test_requests_of_all_running_functions_are_answered_together_in_order():
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
-def test_an_exception_of_answer_is_raised_in_waiting_functions_and_in_the_caller(error):
+def test_an_exception_of_the_answering_function_ends_waiting_functions_and_the_call(error):
     put_away, threads, calls = [], threading.active_count(), iter(range(3))
 
     def work(ask):

@@ -44,7 +44,7 @@ SPREAD = variation.Dispersion({"initial_state": RandomNumbers("uniform", vector(
 
 @pytest.fixture(autouse=True)
 def short_rows(monkeypatch):
-    """Use short rows, as `small_search` does, in tests without it."""
+    """Simulate 10 trials together, as `small_search` does, also in tests without it."""
     monkeypatch.setattr(simulations, "ROW", 10)
 
 

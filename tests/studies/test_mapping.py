@@ -48,13 +48,14 @@ def few_together():
         yield
 
 
-def asked(x, y, text=SHORT):
+def parse_map(x, y, text=SHORT):
+    """Return the scenario and the two axes of a map."""
     loaded = scenario.from_tables(tomllib.loads(text))
     return loaded, mapping.parse_axis(x, "--x", loaded), mapping.parse_axis(y, "--y", loaded)
 
 
 def simulated(x, y, text=SHORT, trials=6):
-    loaded, across, up = asked(x, y, text)
+    loaded, across, up = parse_map(x, y, text)
     return loaded, across, up, mapping.simulate(loaded, across, up, 3, trials, lambda done, total: None).cells
 
 
@@ -130,7 +131,7 @@ def test_axes_have_the_units_of_their_keys():
              "a.b[x]=1:2:3", "a.b[-1]=1:2:3", "a.b[0=1:2:3",
              "hardware.delay=0:0.4:2", "hardware.star_tracker_every=0.6:1.4:9", "a.b=1:1.0000001:5"]
 )  # fmt: skip
-def test_invalid_axes_are_refused(text):
+def test_invalid_axes_of_a_map_are_refused(text):
     with pytest.raises(UsageError, match=r"--y is .*KEY=LOW:HIGH:COUNT"):
         mapping.parse_axis(text, "--y", scenario.from_tables({}))
 
@@ -270,7 +271,7 @@ def test_an_inertia_is_not_replaced_by_a_number(inertia, key, refused):
 
 
 def test_value_is_set_on_all_axes_and_in_missing_keys():
-    loaded, _, _ = asked("hardware.torque_lag=0.01:0.1:2", "controller.delta=1:2:2")
+    loaded, _, _ = parse_map("hardware.torque_lag=0.01:0.1:2", "controller.delta=1:2:2")
     changed: Any = mapping._with_keys(loaded, {"observer.gain": 7.0, "hardware.torque_lag": 0.2, "hardware.delay": 1.0})
     assert changed.observer.gain == (7.0, 7.0, 7.0)
     assert (changed.hardware.torque_lag, changed.hardware.delay) == (0.2, 1)
@@ -284,14 +285,14 @@ def test_map_without_a_valid_pair_is_refused():
 
 
 def test_time_after_t_f_is_constant_if_t_f_is_mapped():
-    loaded, x, y = asked("controller.t_f=4:12:2", "loop.window=0.5:3:2")
+    loaded, x, y = parse_map("controller.t_f=4:12:2", "loop.window=0.5:3:2")
     ends = [mapping._with_keys(loaded, {x.key: a, y.key: b}).loop.t_end for a in x.values for b in y.values]
     assert ends == [6.0, 7.0, 14.0, 15.0]  # 2 s after t_f, or the window if it is longer
 
 
 def test_random_walk_disturbance_makes_trials_differ():
     text = 'loop = { mode = "sampled", period = 0.1 }\ncontroller = { t_f = 5.0, delta = 0.5 }\n'
-    still, walking = (asked("controller.eta=3:4:2", "controller.delta=0.5:0.6:2", text + kind)[0]
+    still, walking = (parse_map("controller.eta=3:4:2", "controller.delta=0.5:0.6:2", text + kind)[0]
                       for kind in ("", "disturbance.kind = 'random_walk'"))  # fmt: skip
     assert [scenario.study(one).drawn for one in (still, walking)] == [False, True]
 
@@ -302,7 +303,7 @@ def test_period_axis_needs_the_sampled_loop():
 
 
 def test_stability_limits_are_drawn_over_period_and_delta_only():
-    loaded, x, y = asked("controller.delta=0.2:0.9:2", "loop.period=0.05:0.1:2")
+    loaded, x, y = parse_map("controller.delta=0.2:0.9:2", "loop.period=0.05:0.1:2")
     for clock, factor, label in (("anchored", 1.5, "3/2"), ("flight", 2.5, "1/2")):
         lines = mapping.stability_limit_formulas(scenario.replace(loaded, loop__clock=clock), x, y)
         delta, period = lines[f"stability limit $\\delta = (\\eta - {label}) h$"]

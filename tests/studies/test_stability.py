@@ -220,7 +220,8 @@ LIMITED = {
 }  # fmt: skip
 
 
-def limited_to(limit):
+def with_torque_limit(limit):
+    """Return the scenario `LIMITED` with another torque limit."""
     return scenario.from_tables(LIMITED | {"hardware": LIMITED["hardware"] | {"torque_limit": limit}})
 
 
@@ -239,7 +240,7 @@ def test_saturated_command_is_reported_as_an_open_loop():
     assert found["not_converged"]  # with this limit, the state 1 decreases to 0.91 in 3 s at best
     assert any(line.startswith("the nominal run has not converged at t_f") for line in report.lines)
     assert report.headline == "The nominal loop is open in the hold phase"
-    found = stability.summary(*stability.find_margins(limited_to(50.0)))
+    found = stability.summary(*stability.find_margins(with_torque_limit(50.0)))
     assert not any(one["open"] for one in (found, *found["before"]))
     assert "not_converged" not in found
     lines = reported(found).lines
@@ -259,8 +260,8 @@ def test_saturated_command_is_reported_as_an_open_loop():
 def test_simulate_does_not_meet_a_required_margin_of_an_open_loop_or_a_failed_run():
     """Earlier, the margins of an open loop counted as unlimited, and those of a failed run as the linearised ones."""
     disturbance = {"amplitude": [1e300], "frequency": [1.0]}  # the linearised loop has no disturbance
-    opened = limited_to(0.02), {}, "not_converged", "the loop is open in the hold phase"
-    failing = limited_to(50.0), {"disturbance": disturbance}, "diverged", "the run failed"
+    opened = with_torque_limit(0.02), {}, "not_converged", "the loop is open in the hold phase"
+    failing = with_torque_limit(50.0), {"disturbance": disturbance}, "diverged", "the run failed"
     for base, changes, status, reason in (opened, failing):
         run = explore.simulate(scenario.replace(base, requirements={"gain_margin": 0.1}, **changes)).run
         (verdict,) = run.verdicts
@@ -281,7 +282,7 @@ def blamed_on_no_limit(found, first, limited):
 @pytest.mark.parametrize("limit", [50.0, 0.5])
 def test_sample_that_the_law_ignores_is_not_reported_as_saturation(limit):
     """Earlier, `margins` reported saturation."""
-    ready, course = stability.find_margins(limited_to(limit))
+    ready, course = stability.find_margins(with_torque_limit(limit))
     k = np.flatnonzero(course.loops.new[:-1, 0].any(axis=(1, 2)))[0]  # a sample without saturation
     nothing = {"gain_up": np.inf, "gain_down": np.inf, "phase": 180.0, "peak_sensitivity": 0.0, "crossover": np.nan}
     each = {name: getattr(course.at_input, name).copy() for name in nothing}

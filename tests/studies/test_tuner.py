@@ -175,6 +175,7 @@ class Found:
 
     @property
     def normalised(self) -> np.ndarray:
+        """Gains between the bounds 0 and 1; here all are at the upper bound."""
         return np.ones(len(self.gains))
 
 
