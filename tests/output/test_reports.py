@@ -418,7 +418,9 @@ def quantiles_of_angles() -> list[Table]:
 
 
 def identified(**changes: Any) -> Report:
-    """Return the report of an identified angle, of a uniform phase, and of a time without prior knowledge."""
+    """Return the report of an accurate moment, an angle, a uniform phase, and a time without prior knowledge."""
+    moment = {"parameter": "inertia_22", "estimate": 11.999942, "std": 6e-5, "lower": 11.999824, "upper": 12.00006,
+              "start": 14.4, "prior_std": 3.0, "unit": "kg m^2"}  # fmt: skip
     angle = {"parameter": "attitude_noise", "estimate": 5e-5, "std": 1e-6, "lower": 4.8e-5, "upper": 5.2e-5,
              "start": 4e-5, "prior_std": 2e-5, "unit": "rad"}  # fmt: skip
     lag = {"parameter": "torque_lag", "estimate": 0.05, "std": 0.01, "lower": 0.03, "upper": 0.07, "start": 0.04,
@@ -426,7 +428,7 @@ def identified(**changes: Any) -> Report:
     phase = {"parameter": "disturbance_phase_1", "estimate": 2.1, "std": 0.02, "lower": 2.06, "upper": 2.14,
              "start": 0.0, "prior_std": math.pi / math.sqrt(3.0), "unit": "rad"}  # fmt: skip
     results = {
-        "parameters": [angle, phase, lag],
+        "parameters": [moment, angle, phase, lag],
         "gyro_bias": [],
         "logs": [],
         "validation": [],

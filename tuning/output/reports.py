@@ -2,6 +2,7 @@
 
 import contextlib
 import csv
+import math
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -133,9 +134,10 @@ def identify_report(summary: Mapping[str, Any]) -> Report:
         prior = format_number(prior_std, ".3g", "none")
         if one["parameter"].startswith("disturbance_phase") and one["prior_std"] is not None:
             prior = "uniform"  # over the circle, the only dispersion of a phase
+        digits = max(5, 2 + math.ceil(math.log10(abs(estimate) / std))) if estimate and std else 5
+        interval = f"{lower:.{digits}g} to {upper:.{digits}g}"
         estimates.append((
-            one["parameter"], f"{estimate:.6g}", f"{std:.3g}", f"{lower:.5g} to {upper:.5g}", f"{start:.6g}", prior,
-            unit or "-",
+            one["parameter"], f"{estimate:.{digits + 1}g}", f"{std:.3g}", interval, f"{start:.6g}", prior, unit or "-",
         ))  # fmt: skip
     for bias in summary["gyro_bias"]:
         for axis, value, std in zip("xyz", bias["estimate"], bias["std"], strict=True):
