@@ -13,9 +13,9 @@ Quaternion = Annotated[
     tuple[Column, Column, Column, Column],
     Meta(description="a list of four names of columns, in the order of `quaternion_order`"),
 ]
-RateUnit = Literal["rad/s", "deg/s", "deg/h"]
-TorqueUnit = Literal["N m", "mN m", "uN m"]
-SpeedUnit = Literal["rad/s", "rpm"]
+RateUnit = Literal["rad/s", "mrad/s", "deg/s", "deg/h", "arcsec/s", "rpm"]
+TorqueUnit = Literal["N m", "N cm", "mN m", "uN m"]
+SpeedUnit = Literal["rad/s", "deg/s", "rpm"]
 Axes = Annotated[tuple[Column, Column, Column], Meta(description="a list of three names of columns")]
 
 

@@ -189,8 +189,16 @@ def test_rates_of_a_slow_slew_in_another_unit_are_refused_with_that_unit():
     assert len(telemetry.measurements(loaded(rate_unit="deg/s"), rows).t) >= 390
 
 
-@pytest.mark.parametrize(("unit", "factor"), [("rad/s", 180.0 / np.pi), ("deg/s", 1.0)])
-def test_rates_of_a_slow_slew_at_a_constant_rate_in_another_unit_are_refused(unit, factor):
+@pytest.mark.parametrize(
+    ("unit", "right", "factor"),
+    [
+        ("rad/s", "deg/s", 180.0 / np.pi),
+        ("deg/s", "rad/s", 1.0),
+        ("rad/s", "mrad/s", 1e3),
+        ("deg/s", "rpm", 30.0 / np.pi),
+    ],
+)
+def test_rates_of_a_slow_slew_at_a_constant_rate_in_another_unit_are_refused(unit, right, factor):
     """Regression: a rotation of 15 deg in 25 parts was too small to be compared."""
     t, rng = np.arange(750) / 5.0, np.random.default_rng(0)
     rate = np.tile([1.4e-3, 9e-4, -6e-4], (t.size, 1))  # 0.1 deg/s
@@ -198,7 +206,6 @@ def test_rates_of_a_slow_slew_at_a_constant_rate_in_another_unit_are_refused(uni
     logged = factor * (rate + 1e-4 * rng.standard_normal(rate.shape))
     columns = {"t": t} | {f"measured_q{k + 1}": attitude.as_quat()[:, k] for k in range(4)}
     columns |= {f"measured_w{k + 1}": logged[:, k] for k in range(3)} | {f"sent{k + 1}": 0.0 * t for k in range(3)}
-    right = "deg/s" if unit == "rad/s" else "rad/s"
     with refuses(RefusedError, f'set telemetry.rate_unit = "{right}"'):
         telemetry.measurements(loaded(rate_unit=unit), pl.DataFrame(columns))
     assert telemetry.measurements(loaded(rate_unit=right), pl.DataFrame(columns)).t.size > 700
@@ -260,7 +267,7 @@ def test_torques_that_compensate_a_disturbance_are_accepted():
     [
         ({"torque": ["a", "b", "c"], "wheel_torque": ["d", "e", "f"]}, "has torque and wheel_torque"),
         ({"wheel_speed": ["a", "b", "c"]}, "telemetry.wheel_inertia is absent"),
-        ({"rate_unit": "rpm"}, "telemetry.rate_unit is"),
+        ({"rate_unit": "rev/day"}, "telemetry.rate_unit is"),
         ({"attitude": ["a", "b"]}, "telemetry.attitude is"),
         ({"attitud": ["a"]}, "telemetry.attitud is not a known key"),
     ],
