@@ -669,7 +669,7 @@ def describe_undetermined(problem: Problem, information: np.ndarray, by_z: np.nd
 
 
 def _describe_slow_sinusoids(problem: Problem, logs: Sequence[Measurements]) -> list[str]:
-    """Return a sentence if an estimated constant may replace a sinusoid whose period is longer than the logs."""
+    """Return a sentence if an estimated constant may replace a fixed sinusoid with a period longer than the logs."""
     names = {parameter.name for parameter in problem.parameters}
     largest_frequency = 2.0 * np.pi / max(float(log.t[-1]) for log in logs)
     is_slow = any(
@@ -677,7 +677,7 @@ def _describe_slow_sinusoids(problem: Problem, logs: Sequence[Measurements]) -> 
         for term in disturbances.terms(problem.model.disturbance)
         if isinstance(term, disturbances.Sinusoid)
     )
-    if not is_slow or "disturbance_bias" not in names or parameters.PHASE in names:
+    if not is_slow or "disturbance_bias" not in names or names & {parameters.PHASE, "disturbance_amplitude"}:
         return []
     return [
         "the data do not tell disturbance_bias from the sinusoid of [disturbance], whose period is longer than the "
