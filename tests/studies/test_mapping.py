@@ -101,6 +101,7 @@ def test_the_default_y_axis_of_a_law_without_delta_is_its_first_gain():
         ("loop.period=100ms:0.4 s:3", [0.1, 0.25, 0.4]),
         ("hardware.attitude_noise=10arcsec:20arcsec:2", np.deg2rad([10 / 3600, 20 / 3600])),
         ("observer.gain[0]=20mNms:40mNms:2", [0.02, 0.04]),
+        ("requirements.peak_torque=1:2:2", [1.0, 2.0]),
     ],
 )
 def test_axes(text, values):
@@ -120,6 +121,9 @@ def test_axes_have_the_units_of_their_keys():
     assert (
         mapping.label_with_unit(scenario.from_tables({}), "hardware.delay") == "hardware.delay"
     )  # no table [hardware]
+    suite = [{"kind": "star_tracker", "noise_across": 1e-5, "noise_about": 1e-4}, {"kind": "gyro", "rate_noise": 1e-5}]
+    with_suite = scenario.from_tables({"loop": {"mode": "sampled"}, "sensors": suite})
+    assert mapping.label_with_unit(with_suite, "sensors.rate_noise") == "sensors.rate_noise"
     custom = scenario.read(ROOT / "scenarios" / "own_parts.toml")
     assert mapping.label_with_unit(custom, "controller.t_f") == "controller.t_f [s]"
     assert mapping.label_with_unit(custom, "controller.k1") == "controller.k1"  # a custom class states no unit

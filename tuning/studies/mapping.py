@@ -19,6 +19,7 @@ from ptsmc_jax.figures import study_plots, style
 from ptsmc_jax.scenario import Study, custom, errors, keys, parsing, study, tables
 from ptsmc_jax.scenario import replace as replace_keys
 from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.scenario.sensor_tables import SensorSuite
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import requirements
 from ptsmc_jax.simulation.rollout import Parts
@@ -367,7 +368,9 @@ def unit_of(scenario: Scenario, key: str) -> str:
     table, _, name = key.partition(".")
     declared, kinds = getattr(scenario, table, None), scenario.TABLES.get(table)
     struct = type(declared) if declared is not None else kinds
-    known_keys = keys.list_keys(struct, scenario.unit_of_d) if isinstance(struct, type) else ()
+    if kinds is None or not isinstance(struct, type) or struct is SensorSuite:  # such as [requirements]
+        return ""
+    known_keys = keys.list_keys(struct, scenario.unit_of_d)
     return next((entry.unit for entry in known_keys if entry.name == name.partition("[")[0]), "")
 
 
