@@ -79,7 +79,8 @@ def _faulty_line(text: str, message: str) -> str:
     if place is None:
         return ""
     line = " ".join(text.split("\n")[int(place[1]) - 1].split())
-    without_quotes = re.search(r"=([^\"'#=]*[\s\d\]])?[A-Za-zµ°][^\"'#=]*(#.*)?$", line)
+    value = re.search(r"=([^\"'#=]*)(#.*)?$", line)
+    without_quotes = value is not None and re.search(r"(^|[\s\d\]])[A-Za-zµ°]", value[1])
     hint = "; a text needs quotes, also a number with a unit" if without_quotes else ""
     return f": {line[:LONGEST_KEY]}{hint}" if line.isprintable() else ""
 

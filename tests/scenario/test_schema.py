@@ -286,6 +286,7 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path, content, said):
         ),
         ("inertia = [350 kg cm^2, 300, 320]", "inertia = [350 kg cm^2, 300, 320]; a text needs quotes"),
         ("[loop]\nt_end = 60,0\n", "(at line 2, column 11): t_end = 60,0"),
+        (f'mode = {100_000 * "a "}"', "mode = a a a"),  # in a time that is not quadratic in the length
     ],
 )
 def test_an_error_of_the_parser_quotes_the_line(tmp_path, content, quoted):
