@@ -66,7 +66,7 @@ def judge_trials(
 ) -> list[Verdict]:
     """Return the verdict on each required margin: of the nominal loop, or the worst of the first `TRIALS` trials.
 
-    A trial that failed meets no requirement.
+    A trial that failed meets no requirement. Trials after the first `TRIALS` ones do not matter.
 
     Args:
         ready: the scenario, ready to simulate.
@@ -77,14 +77,13 @@ def judge_trials(
     Returns:
         The verdicts. The nominal run decides whether runs come to rest.
     """
-    trials = _select_trials(ready, rows)
+    trials, finished = _select_trials(ready, rows), np.atleast_1d(finished)[:TRIALS]
     if trials is None or limit_cycles.find(ready.parts) is not None:
         return judge_loop(ready.parts, ready.margins, finished=finished)
     limits = {requirement.metric: requirement.limit for requirement in ready.margins}
     by_name, is_open = worst_margins(ready.parts, ready.dispersion, seed, trials, limits)
     failed = np.zeros_like(is_open)
-    simulated = np.atleast_1d(finished)[: failed.size]
-    failed[: simulated.size] = ~simulated
+    failed[: finished.size] = ~finished
     by_name = {name: np.where(failed, np.nan, values) for name, values in by_name.items()}
     return _verdicts(ready.margins, by_name, {FAILED: failed, OPEN: is_open & ~failed})
 

@@ -272,6 +272,14 @@ def test_a_trial_that_failed_meets_no_required_margin(drawn):
         assert str(verdict).endswith("no worst value, as the run failed in 1 trial: NOT met in 1 of 6 loops")
 
 
+def test_trials_that_fail_after_the_judged_trials_change_no_verdict_on_the_nominal_loop():
+    ready = scenario.study(scenario.from_tables({**DRAWN["chain"], "dispersion": {}}))
+    finished = np.arange(2 * TRIALS) != TRIALS
+    assert [verdict.reason for verdict in margin_verdicts.judge_trials(ready, 3, None, finished)] == ["", ""]
+    reasons = [verdict.reason for verdict in margin_verdicts.judge_trials(ready, 3, None, finished[1:])]
+    assert reasons == ["the run failed in 1 trial"] * 2
+
+
 @pytest.mark.long
 def test_margin_gradients_with_dispersed_inertia_compile_if_delta_is_free():
     """Delta is free by default. The test starts another process, because XLA aborted it in an earlier version."""
