@@ -385,9 +385,11 @@ def _possible_parameters(
         add_vector("mode_damping", "-", "add", "plant.damping", plant.frequency.size)
         possible["mode_coupling"] = lambda: _coupling_parameter(model, *prior_sigma("mode_coupling", 1))
     if not model.is_spacecraft:  # the numbers inside a custom plant
-        for k, (key_path, leaf) in enumerate(tree_flatten_with_path(plant)[0]):
-            # the argument 0 of a `jax.tree_util.Partial` H is plant.H[0], its argument drag is plant.H['drag']
-            path = "plant" + keystr(tuple(key for key in key_path if not isinstance(key, FlattenedIndexKey)))
+        leaves = tree_flatten_with_path(plant)[0]
+        # the argument 0 of a `jax.tree_util.Partial` H is plant.H[0], its argument drag is plant.H['drag']
+        short = [keystr(tuple(key for key in path if not isinstance(key, FlattenedIndexKey))) for path, _ in leaves]
+        for k, (key_path, leaf) in enumerate(leaves):
+            path = "plant" + (short[k] if short.count(short[k]) == 1 else keystr(key_path))
             if not path.startswith(("plant.inertia", "plant.z0")):
                 possible.setdefault(path, lambda path=path, k=k, leaf=leaf: _leaf_parameter(path, model, k, leaf))
     if isinstance(getattr(scenario, "sensors", None), SensorSuite):

@@ -546,6 +546,41 @@ def test_numbers_of_a_custom_plant_are_identified_and_named_by_function_and_argu
     assert np.all(found.std < [0.01, 0.01])
 
 
+def test_numbers_of_a_custom_pytree_in_a_custom_plant_have_different_names():
+    """Classes without keys number their leaves. Earlier, all of them had one name, and only the first was known."""
+
+    @jax.tree_util.register_pytree_node_class
+    class Pendulum:
+        def __init__(self, stiffness, drag):
+            self.numbers = stiffness, drag
+
+        def __call__(self, t, x_1, x_2):
+            stiffness, drag = self.numbers
+            return -stiffness * jnp.sin(x_1) - drag * x_2
+
+        def tree_flatten(self):
+            return self.numbers, None
+
+        @classmethod
+        def tree_unflatten(cls, _, numbers):
+            return cls(*numbers)
+
+    pendulum = Pendulum(jnp.asarray(9.81), jnp.asarray(0.1))
+    loaded = scenario.from_tables({
+        "plant": {
+            "kind": "system",
+            "system": plants.system(1, lambda t, x_1, x_2: x_2, pendulum, lambda t, x_1, x_2: jnp.eye(1)),
+            "x0": [1.0, 0.0],
+        },
+        "loop": {"mode": "sampled"},
+        "hardware": {"state_noise": [1e-3, 1e-3]},
+    })  # fmt: skip
+    log = telemetry.measurements(loaded, explore.simulate(loaded).to_polars())
+    names = ["plant.H[<flat index 0>]", "plant.H[<flat index 1>]"]
+    problem = parameters.build(loaded, [log], names)
+    np.testing.assert_allclose(problem.numbers(np.zeros(2)), pendulum.numbers, rtol=1e-12)
+
+
 def test_noise_of_a_star_tracker_is_about_its_own_axes():
     """A run with a tilted star tracker, whose noise about the boresight is 10 times as large as across it."""
     tables = {
