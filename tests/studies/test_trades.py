@@ -11,7 +11,7 @@ import pytest
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns.montecarlo import Trials
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.simulation import catalogues
+from ptsmc_jax.simulation import catalogues, rollout
 from ptsmc_jax.simulation.metrics import METRICS, Metrics
 from tests.helpers import SHORT_CHAIN, refused, refuses, small_search
 from tests.output.pages import checked
@@ -163,6 +163,14 @@ def test_sensitivity_limit_replaces_the_margins_that_it_bounds():
     known = scenario.from_tables({**tomllib.loads(SHORT_CHAIN), "requirements": asked})
     limited = trades.Margins(known, (6.0, 4.0)).base
     assert limited.requirements == {"peak_torque": 3.0, "delay_margin": 0.02, "peak_sensitivity": 4.0}
+
+
+def test_margins_of_a_front_are_those_of_the_loops_if_a_trial_fails():
+    tables = {name: table for name, table in tomllib.loads(SHORT_CHAIN).items() if name != "dispersion"}
+    made, status = scenario.from_tables(tables), np.array([0, rollout.DIVERGED])
+    trials = Trials(np.arange(2), Metrics(dict.fromkeys(METRICS, np.ones(2))), status, np.zeros(2), {})
+    costs = trades.Margins(made).costs(made, trials, 0)
+    assert min(costs[name] for name in MARGINS) > 0.0
 
 
 def test_faster_slew_needs_more_torque_and_is_less_accurate(command, tmp_path, monkeypatch):

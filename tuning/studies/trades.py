@@ -229,10 +229,12 @@ class Margins(Trade):
         return targets, known
 
     def costs(self, tuned: Scenario, trials: Trials, seed: int) -> dict[str, float]:
-        """Return the largest peak torque [N m], and the worst margins of the held-out trials' loops."""
+        """Return the largest peak torque [N m], and the worst margins of the held-out trials' loops.
+
+        Loops of trials that fail count, too: a margin without a value would look like an unlimited one.
+        """
         with_margins = scenarios.replace(tuned, requirements=dict.fromkeys(MARGINS, 1.0))
-        ready = study(judging.on_flight_clock(with_margins))
-        verdicts = margin_verdicts.judge_trials(ready, seed, None, trials.finished)
+        verdicts = margin_verdicts.judge_trials(study(judging.on_flight_clock(with_margins)), seed)
         return {TORQUE: judging.required_quantile(TORQUE, tuned, trials)} | {v.metric: v.worst for v in verdicts}
 
     def options(self) -> dict[str, object]:
