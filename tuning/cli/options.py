@@ -30,7 +30,7 @@ def whole_number(minimum: int = 0, maximum: int = 2**32 - 1, **others: Any) -> P
 
 
 def positive(unit: str) -> Parameter:
-    """Return an option that is a number greater than 0 in a unit, or with another unit such as "2 deg/s"."""
+    """Return an option that is a finite number greater than 0 in a unit, or with another unit such as "2 deg/s"."""
 
     def parse(_: object, tokens: Sequence[Token]) -> float:
         text = tokens[0].value
@@ -39,7 +39,7 @@ def positive(unit: str) -> Parameter:
         except ValueError:
             raise ValueError(f"{text} is no number in {unit} or with a unit such as {units.EXAMPLES[unit]}") from None
 
-    return Parameter(converter=parse, validator=Number(gt=0))
+    return Parameter(converter=parse, validator=Number(gt=0, lt=float("inf")))
 
 
 ScenarioFile = Annotated[Path | None, Parameter(help="Scenario file (TOML); default: the paper's Case I.")]
