@@ -14,7 +14,7 @@ _TURN = Decimal("6.28318530717958647692528676656")  # 2 pi
 _KG, _M, _S, _RAD = {"kg": 1.0}, {"m": 1.0}, {"s": 1.0}, {"rad": 1.0}
 _RATE = {"rad": 1.0, "s": -1.0}
 
-PREFIXES = {"n": "1e-9", "u": "1e-6", "m": "1e-3", "c": "1e-2", "k": "1e3", "M": "1e6"}
+PREFIXES = {"n": "1e-9", "u": "1e-6", "m": "1e-3", "c": "1e-2", "k": "1e3"}
 # symbols that may have one of these prefixes: value in SI units, and powers of the base units
 WITH_PREFIX: dict[str, tuple[Decimal | int, Mapping[str, float]]] = {
     "rad": (1, _RAD),

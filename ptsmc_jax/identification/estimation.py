@@ -711,7 +711,6 @@ def _build_result(
         return replace(fit, adjusted=search.innovations(z + step, screened), distance=distance)
 
     fits = [fit_log(log) for log in logs]
-    ambiguities = [*best.ambiguities, *_describe_slow_sinusoids(problem, logs)]
     variance_factor = max(fit.variance_factor for fit in fits)
     z_covariance = inflated_covariance(best.information, np.diag(search.prior_weight), variance_factor)
     return Identification(
@@ -724,9 +723,10 @@ def _build_result(
         covariance=by_z @ z_covariance @ by_z.T,
         undetermined=[
             *describe_undetermined(problem, best.information - np.diag(search.prior_weight), by_start),
-            *ambiguities,
+            *best.ambiguities,
+            *_describe_slow_sinusoids(problem, logs),
         ],
-        is_determined=determines_all(best.information) and not ambiguities,
+        is_determined=determines_all(best.information) and not best.ambiguities,
         variance_factor=variance_factor,
         fits=fits,
         validation=[fit_log(log, is_validation=True) for log in validation_logs],
