@@ -42,12 +42,17 @@ def result_table(front: Front) -> Table:
             format_error(point.rms, plant),
             relative_spread(point),
             *(format_ratio(ratio_to_bound(point.rms, front.lower_bound)) for _ in bound_heading),
-            *(format_number(point.costs[name], ".4g", "none" if name.endswith("margin") else "-") for name in costs),
+            *(format_number(point.costs[name], ".4g", _describe_no_value(name, point)) for name in costs),
             _describe_marks(point),
         )
         for label, point in rows
     ]
     return Table((KINDS[front.against].label(plant), "RMS error", "+-", *bound_heading, *heads, ""), cells)
+
+
+def _describe_no_value(cost: str, point: Point) -> str:
+    """Return "none" for a margin without a limit, which the peak sensitivity of a closed loop shows, or "-"."""
+    return "none" if cost.endswith("margin") and math.isfinite(point.costs.get("peak_sensitivity", math.nan)) else "-"
 
 
 def gain_table(front: Front) -> Table:

@@ -34,7 +34,8 @@ MAP_NOTE = (
     "sampling. radius, gain_margin and delay_margin belong to the loop at the hand-over with frozen gains, hold_radius "
     "and the others with hold_ to the hold phase. The loop is stable up to a radius of 1. gain_margin and "
     "delay_margin are those of the worst axis; they are not positive if the loop is unstable. meets is 0 if a "
-    "requirement is not met, which not_met names, or if a trial fails or does not converge at t_f."
+    "requirement is not met, which not_met names, or if a trial fails or does not converge at t_f. Gains that the "
+    "scenario does not state are designed once, and not again for each pair."
 )
 
 
@@ -222,7 +223,6 @@ def map_lines(pairs: Sequence[Mapping[str, Any]], keys: tuple[str, str], plant: 
     not_met = Counter(" ".join(texts).split()).most_common()
     if not_met:
         yield f"not met: {', '.join(f'{name} at {count} of {len(simulated)} pairs' for name, count in not_met)}"
-    yield "default gains are designed once for the scenario, and not again for each pair"
     refused = [pair["status"] for pair in pairs if pair["status"] != "simulated"]
     if refused:
         yield f"{len(refused)} of {len(pairs)} pairs are not allowed, the first one because {refused[0]}"
