@@ -15,7 +15,7 @@ from ptsmc_jax.scenario import errors, keys, layouts, sensor_tables
 from ptsmc_jax.scenario.attitude_keys import Attitude
 from ptsmc_jax.scenario.tables import Limit
 from ptsmc_jax.scenario.values import Kinds, Table
-from ptsmc_jax.simulation import catalogues
+from ptsmc_jax.simulation import catalogues, rollout
 from tuning.cli.main import app
 
 HERE = Path(__file__).parent
@@ -55,12 +55,18 @@ The terminal and the figures show angles in arcsec or degrees. They show `termin
 `hold_error` of a spacecraft as the angle 2 asin |v| of the norm |v|. The files have each metric in the unit of the
 tables below.
 
-| run | in the summary |
-| --- | --- |
-| it never settles | `settling_time` is null, and a limit on `settling_time` is violated |
-| it diverged or met the singularity of the law | it has a status, a reason and a time, and violates every requirement |
-| another metric is infinite or has no value | it counts as diverged at t_end |
-| it is `not_converged`: at t_f it is far from the reference | its metrics count |
+If a run never settles, `settling_time` is null, and a limit on `settling_time` is violated. If another metric is
+infinite or has no value, the run counts as diverged at t_end.
+
+## Status of a run
+
+Files have the name of the status. If it is not `ok`, they also have a reason and a time, `bad_time`. In Python the
+results of `simulate_parts`, `one` and `run` have the number. `ptsmc.STATUS[number]` is its name and reason, and
+`ptsmc.has_finished(status)` is true if the metrics count. If they do not count, the run violates every requirement.
+
+STATUS_TABLE
+
+## Verdicts
 
 `verdicts` in `summary.json` is a list with an entry for each requirement:
 
@@ -162,7 +168,12 @@ def scenarios() -> str:
 
 def metric_list() -> str:
     """Return the reference of the metrics."""
-    parts = ["# Metrics", MADE, METRICS]
+    statuses = [
+        [str(code), f"`{name}`", reason or "reached t_end", "count" if code in rollout.FINISHED else "do not count"]
+        for code, (name, reason) in rollout.STATUS.items()
+    ]
+    text = METRICS.replace("STATUS_TABLE", _grid("number status meaning metrics", statuses))
+    parts = ["# Metrics", MADE, text]
     for title, known in (
         ("A spacecraft's", catalogues.CATALOGUE),
         ("Those of chains and systems", catalogues.STATE_CATALOGUE),

@@ -120,8 +120,9 @@ for metric, row in jax.jacfwd(outcome)(gains).items():
 # \ln \sqrt{\tfrac1{16} \textstyle\sum_i J_i^2} \;+\; 0.5\ \overline{\int |u_i|\,\mathrm{d}t} .
 # $$
 #
-# Adam minimises it over the logarithms of four gains. A traced run raises no error. If a run fails, its status is not 0,
-# and the loss is set to NaN.
+# Adam minimises it over the logarithms of four gains. A traced run raises no error. If a run does not reach its end, for
+# example because it diverged, `ptsmc.has_finished` of its status is false, and the loss is set to NaN. A run that has not
+# converged at $t_f$ has finished, and its metrics count.
 
 # %%
 some = jnp.linspace(0, count - 1, 16).astype(int)
@@ -131,7 +132,8 @@ def loss(logs):
     moved = ptsmc.with_gains(parts, {name: jnp.exp(value) for name, value in logs.items()})
     run = jax.vmap(simulate, (None, 0, 0))(moved, attitudes[some], some.astype(jnp.uint32))
     rms, effort = jnp.sqrt(jnp.mean(run.metrics.window_error**2)), jnp.mean(run.metrics.effort)
-    value = jnp.where(jnp.all(run.status == 0), jnp.log(rms) + 0.5 * effort, jnp.nan)
+    finished = jnp.all(ptsmc.has_finished(run.status))
+    value = jnp.where(finished, jnp.log(rms) + 0.5 * effort, jnp.nan)
     return value, (value, rms, effort)
 
 

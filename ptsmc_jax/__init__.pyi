@@ -61,6 +61,7 @@ from ptsmc_jax.simulation.requirements import Requirement as Requirement
 from ptsmc_jax.simulation.rollout import STATUS as STATUS
 from ptsmc_jax.simulation.rollout import Parts as Parts
 from ptsmc_jax.simulation.rollout import Result as Result
+from ptsmc_jax.simulation.rollout import has_finished as has_finished
 from ptsmc_jax.simulation.rollout import simulate_parts as simulate_parts
 
 __version__: str

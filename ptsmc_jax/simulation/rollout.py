@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, ArrayLike, PyTree
 
 from ptsmc_jax import programs
 from ptsmc_jax.devices.ticks import Ticks
@@ -42,6 +42,24 @@ SINGULAR_DISTANCE = 1e-3
 # a run has not converged if its angle at t_f is larger than both of these
 NOT_CONVERGED_FRACTION = 0.05  # fraction of the initial angle
 NOT_CONVERGED_SETTLING_ANGLES = 10.0
+
+
+def has_finished(status: ArrayLike) -> Array:
+    """Return whether runs were simulated to t_end, so that their metrics count, even if they did not converge at t_f.
+
+    Args:
+        status: codes of `STATUS`, of any shape; they may be traced.
+
+    Returns:
+        An array of the same shape, bool.
+
+    Raises:
+        TypeError: the status is a name, such as "ok".
+
+    >>> has_finished(jnp.array([0, 1, 4])).tolist()
+    [True, False, True]
+    """
+    return jnp.isin(status, jnp.array(FINISHED))
 
 
 class Log(NamedTuple):

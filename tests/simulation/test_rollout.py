@@ -223,6 +223,26 @@ def test_a_run_that_starts_on_the_target_is_missed_beyond_ten_settling_angles(di
     np.testing.assert_equal(float(result.bad_time), 5.0 if status == rollout.NOT_CONVERGED else np.nan)
 
 
+def test_runs_that_did_not_converge_have_finished():
+    """A loss with this mask keeps the metrics and the derivatives of a run that did not converge at t_f."""
+    codes = jnp.array(list(rollout.STATUS))
+    names = [name for name, _ in rollout.STATUS.values()]
+    assert [name for name, count in zip(names, jax.jit(rollout.has_finished)(codes), strict=True) if count] == [
+        "ok", "not_converged",
+    ]  # fmt: skip
+    slow = chain_parts([0.0, 0.0], disturbance=disturbances.Constant(vector([50.0])))
+
+    def loss(eta):
+        run = rollout.simulate_once(with_gains(slow, {"eta": eta}))
+        return jnp.where(rollout.has_finished(run.status), run.metrics.window_error, jnp.nan), run.status
+
+    derivative, status = jax.jacfwd(loss, has_aux=True)(jnp.asarray(3.0))
+    assert int(status) == rollout.NOT_CONVERGED
+    assert abs(derivative) > 1.0
+    with pytest.raises(TypeError):
+        rollout.has_finished("ok")  # type: ignore[arg-type]  # the status of `ptsmc.simulate`
+
+
 def simulated(plant, mode, **tables):
     loop = {"mode": mode, "settling_angle": 1e-3}
     return runs.simulate(scenario.study(scenario.from_tables({"plant": plant, "loop": loop, **tables})))

@@ -314,8 +314,7 @@ def judge(
 
 def mark_failures(value: Array, status: Array) -> Array:
     """Return the values of completed trials, and `FAILED` for trials that failed or lack a value, (trials,)."""
-    completed = (status == rollout.OK) | (status == rollout.NOT_CONVERGED)
-    return jnp.where(completed & ~jnp.isnan(value), value, FAILED)
+    return jnp.where(rollout.has_finished(status) & ~jnp.isnan(value), value, FAILED)
 
 
 def ignore_failures(c: np.ndarray) -> np.ndarray:
