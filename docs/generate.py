@@ -3,6 +3,8 @@
 `python docs/generate.py` writes them. A test fails if they differ from the code.
 """
 
+import inspect
+import re
 import sys
 import typing
 from collections.abc import Iterator, Mapping
@@ -105,8 +107,19 @@ the reference to the body, in body axes. The half-cone error is the angle betwee
 direction. For means and differences it is a two-dimensional vector across the boresight. The errors are evaluated at
 the ends of control periods and at the start of the observation, RPE also at the ends of windows. Means are integrals
 over time. Half-cones of RPE, PDE and RKE are up to 0.5 % too large. PDE is the largest difference between the means
-of any two windows. The measured attitude is constant between samples.
-"""
+of any two windows. The measured attitude is constant between samples."""
+HISTORY = """\
+## History of a run in Python
+
+`run.log` of `ptsmc.simulate_parts(parts, record=True)` has a row for the start of each control period or integration
+step, and a last row at t_end. Its arrays have the shape (time, component). The units are those of a spacecraft; a chain
+or a system has its own. Exclude rows without a length from sums and means: `jnp.mean(x, where=run.log.has_length)`.
+
+`u` is the delivered torque, and `commanded` is the commanded torque. They differ by limits, delay, lag and hardware
+errors of the actuators. `peak_torque` is the largest component of `commanded`, and `peak_torque_delivered` is the
+largest component of `u`. `readings` has the sensor readings, such as `attitude` and `rate`.
+
+HISTORY_TABLE"""
 REQUIREMENTS = """\
 The name of any [metric](metrics.md), with the largest value that is allowed in every trial, or with a table. An example
 is `window_error = { limit = 1e-4, quantile = 0.9973, confidence = 0.9 }`. For a [pointing error](pointing.md), the
@@ -182,7 +195,9 @@ def metric_list() -> str:
             f"## {title}",
             _grid("metric unit meaning", [[f"`{key}`", one.unit, one.meaning] for key, one in known.items()]),
         ]
-    return _page([*parts, ERRORS])
+    history = re.findall(r"^    (\w+): .*?  # (.*)$", inspect.getsource(rollout.Log), re.MULTILINE)
+    rows = [[f"`{name}`", content] for name, content in history]
+    return _page([*parts, ERRORS, HISTORY.replace("HISTORY_TABLE", _grid("field content", rows))])
 
 
 def commands() -> str:

@@ -20,7 +20,7 @@ import ptsmc_jax
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import store
 from ptsmc_jax.scenario import from_tables, keys, layouts
-from ptsmc_jax.simulation import catalogues
+from ptsmc_jax.simulation import catalogues, rollout
 from tests.helpers import SHORT, SHORT_CHAIN
 from tests.onboard.flights import PROFILE
 from tests.tree import ROOT, modules
@@ -73,6 +73,7 @@ def test_reference_pages_name_every_key_and_metric():
                 ), struct
     for catalogue in catalogues.CATALOGUES.values():
         assert all(f"| `{metric}` | {entry.unit} | " in metric_list for metric, entry in catalogue.items())
+    assert all(f"| `{field}` | " in metric_list for field in rollout.Log._fields)
 
 
 def test_the_scenario_page_states_the_allowed_values_of_every_dispersion():

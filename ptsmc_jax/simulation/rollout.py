@@ -68,19 +68,19 @@ class Log(NamedTuple):
     In the sampled loop the row at t_end has d_hat and s of a further sample, and the torques held until t_end.
     """
 
-    t: Array  # [s]
-    x: PyTree  # true state
+    t: Array  # time [s]
+    x: PyTree  # true state; of a spacecraft `x.q`, quaternion with the scalar last [-], and `x.w`, body rate [rad/s]
     d_hat: Array  # estimated disturbance [N m]
-    u: Array  # torque delivered from this time on [N m]
-    commanded: Array  # [N m]
+    u: Array  # torque that the actuators deliver from this time on [N m]
+    commanded: Array  # torque that the law commands, after a command filter, before limits and delay [N m]
     s: Array  # sliding variable that the law used
     disturbance: Array  # true disturbance [N m]
-    reference: PyTree  # target of the reference
+    reference: PyTree  # target of the reference, for a spacecraft with `q` [-], `w` [rad/s] and `w_dot` [rad/s^2]
     error: Array  # error that the law drives to zero: the attitude error vector [-]; for a chain x_1
-    wheels: tuple[Array, Array] | None  # momentum of each reaction wheel [N m s], and its torque [N m]
+    wheels: tuple[Array, Array] | None  # momentum [N m s] and torque [N m] of each reaction wheel
     has_length: Array  # bool: the interval of this row has a positive length, or the row is the last
     readings: dict[str, Array] | None = None  # sensor readings, see `Sensor.inputs`; None in the continuous loop
-    sent: Array | None = None  # torque that the computer sends to the actuators [N m]
+    sent: Array | None = None  # torque that the computer sends to the actuators [N m]; None in the continuous loop
 
     __repr__ = listing
 
