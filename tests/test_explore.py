@@ -1,3 +1,4 @@
+import inspect
 import re
 import tomllib
 from typing import Any
@@ -332,6 +333,10 @@ def test_tuned_gains_meet_the_requirements_again(monkeypatch):
     assert {"history", "tradeoff"} <= set(tuned.plot())
 
 
-def test_tuning_has_no_other_names():
+def test_tuning_lists_its_functions_and_has_no_other_names():
+    made = inspect.getmembers(tuning.explore, inspect.isfunction)
+    functions = {name for name, one in made if one.__module__ == "tuning.explore" and not name.startswith("_")}
+    assert functions <= set(dir(tuning))
+    assert all(getattr(tuning, name) is getattr(tuning.explore, name) for name in functions)
     with pytest.raises(AttributeError, match="module 'tuning' has no attribute 'nothing'"):
         tuning.nothing  # noqa: B018

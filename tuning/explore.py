@@ -1,10 +1,11 @@
-"""Short functions for notebooks: tune gains, trace a Pareto front, find margins, run a campaign. Start with `tune`.
+"""Short functions for notebooks: tune gains, compare laws, find margins, run a campaign. Start with `tune`.
 
 Each result has the report of the command of the same name. Notebooks show the report as tables, `print` as text.
 """
 
 import html
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -32,6 +33,7 @@ from tuning.studies import (
     tune_files,
     tuner,
 )
+from tuning.studies import compare as comparing
 from tuning.studies import pareto as fronts
 from tuning.studies.campaign_folder import Folder
 from tuning.studies.front import KINDS, Front, Point
@@ -179,6 +181,47 @@ def pareto(
     draws.check_whole_number("seed", seed)
     trade = trades.build(against, posing.with_tune(_to_scenario(what)), points, values)
     return Traced(trade, fronts.trace(trade, seed))
+
+
+@dataclass(frozen=True, repr=False)
+class Compared(Outcome):
+    """Several laws, tuned to the same requirements. Its figures are those of `ptsmc compare`."""
+
+    comparison: comparing.Comparison
+
+    @cached_property
+    def summary(self) -> dict[str, Any]:
+        """The content of `summary.json`."""
+        return comparing.summary(self.comparison)
+
+    @property
+    def report(self) -> Report:
+        """The report of `ptsmc compare`."""
+        return reports.build("compare", self.summary, "spacecraft")
+
+    def _figures(self) -> dict[str, "Figure"]:
+        return dict(comparing.plot_figures(self.comparison))
+
+
+def compare(what: Scenario | Study | str | Path, *, against: Sequence[str] | None = None, seed: int = 0) -> Compared:
+    """Tune several laws to the same requirements and compare them, as `ptsmc compare` does.
+
+    Args:
+        what: a scenario, the path of its file, or a study. If its law is custom, it is compared, too.
+        against: kinds of the built-in laws, such as "pd", beside the prescribed-time law; None: all of them.
+        seed: seed of the searches and their trials.
+
+    Raises:
+        ScenarioError: the scenario is not valid, or a law cannot be used in it.
+        ValueError: a kind is unknown, or `seed` is not a whole number from 0 to 2^32 - 1.
+    """
+    draws.check_whole_number("seed", seed)
+    rivals = comparing.Rivals(None if against is None else tuple(against))
+    rivals.check()
+    loaded = posing.with_tune(_to_scenario(what))
+    comparing.check(loaded)
+    contenders = comparing.validated_contenders(loaded, rivals)
+    return Compared(comparing.compare(loaded, seed, lambda *_: None, None, contenders))
 
 
 @dataclass(frozen=True, repr=False)

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+import tuning
 from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.campaigns.store import RefusedError
@@ -208,7 +209,7 @@ def test_every_law_appears_in_table_page_and_figures(eight, tmp_path):
             assert series["y"] == [row[0] for row in table.rows]
     arcsec = [format_ratio(np.degrees(2 * np.arcsin(bound)) * 3600) for bound in (low, high)]
     assert answers[0][1].rows[3][2] == f"{arcsec[0]} to {arcsec[1]}"
-    figures = dict(compare._plot_figures(found))
+    figures = dict(compare.plot_figures(found))
     drawn = [line for line in figures["settling"].axes[0].lines if line.get_marker() in study_plots.MARKERS]
     looks = {(line.get_color(), line.get_marker()) for line in drawn}
     assert len(drawn) == len(looks) == len(names)
@@ -329,6 +330,20 @@ def test_all_laws_are_tuned_by_one_seed_and_judged_by_another(monkeypatch, eight
     assert compare.identity(made.contenders["published"].simulated, 5) != compare.identity(
         made.contenders["published"].simulated, 6
     )
+
+
+def test_the_function_compares_the_same_laws_as_the_command(monkeypatch, eight):
+    asked = rivals(monkeypatch, eight)
+    found = tuning.compare(scenario.from_tables(TABLES), against=["pd"], seed=5)
+    assert [(law, seed) for what, law, seed in asked if what == "tune"] == [("prescribed_time", 5), ("pd", 5)]
+    assert list(found.summary["laws"]) == ["published", "prescribed_time", "pd"]
+    assert found.report.headline in repr(found)
+    assert list(found.plot("tradeoff")) == ["tradeoff"]
+    for other, said in ((["lqr"], "is lqr, but must be one of pd"), ("pd", "is p, but must be one of pd")):
+        with pytest.raises(ValueError, match=said):
+            tuning.compare(scenario.from_tables(TABLES), against=other)
+    with pytest.raises(ScenarioError, match=r"plant\.kind"):
+        tuning.compare(scenario.from_tables({"plant": {"kind": "chain"}}))
 
 
 def test_an_interruption_ends_the_comparison(monkeypatch, eight):

@@ -381,7 +381,7 @@ def write(
         store.write_toml(folder / "scenarios" / f"{law}.toml", tables)
     store.write_csv(folder / "compare.csv", *_csv_table(scenario, content))
     if figures:
-        style.save(dict(_plot_figures(comparison)), folder / "figures")
+        style.save(dict(plot_figures(comparison)), folder / "figures")
 
 
 _COLUMNS = ("window_error", "peak_torque", "largest_peak_torque", "effort", "chattering", "unsettled")
@@ -411,7 +411,8 @@ def _csv_table(scenario: Scenario, content: Mapping[str, Any]) -> tuple[list[str
     return header, [row(law, figures) for law, figures in content["laws"].items()]
 
 
-def _plot_figures(comparison: Comparison) -> Iterator[tuple[str, Figure]]:
+def plot_figures(comparison: Comparison) -> Iterator[tuple[str, Figure]]:
+    """Yield the figures of a comparison with their names."""
     ours = comparison.contenders[OURS]
     # the tuned law is first, as in the figures of `tune`, and has the same colour there
     trials_by_law = {law: contender.trials for law, contender in {OURS: ours, **comparison.contenders}.items()}
