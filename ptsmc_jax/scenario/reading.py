@@ -111,7 +111,7 @@ def replace(scenario: Scenario | str | Path, **changes: object) -> Scenario:
     Args:
         scenario: a scenario or the path of its file.
         changes: values by key, written table__key, or whole tables by name, also those of another scenario. None
-            restores the default.
+            restores the default. The path of a file is relative to the working directory.
 
     Raises:
         ScenarioError: a value or a combination of values is not allowed.
