@@ -99,6 +99,9 @@ the states and the input.
 | `within_ape_x` and similar | a requirement limits a fraction of the time |
 | AKE, MKE, RKE | the attitude is measured with noise or filtered |
 
+A run without the condition does not have the metric, and its status is `ok` all the same. In Python the attribute, such
+as `run.metrics.ape_boresight`, is then NaN, and `"ape_boresight" in run.metrics` is false.
+
 Custom metrics: `ptsmc montecarlo --metrics`.
 
 The observation of pointing errors begins `after` t_f and ends at t_end. It consists of consecutive windows; an
@@ -112,8 +115,9 @@ HISTORY = """\
 ## History of a run in Python
 
 `run.log` of `ptsmc.simulate_parts(parts, record=True)` has a row for the start of each control period or integration
-step, and a last row at t_end. Its arrays have the shape (time, component). The units are those of a spacecraft; a chain
-or a system has its own. Exclude rows without a length from sums and means: `jnp.mean(x, where=run.log.has_length)`.
+step, and a last row at t_end. Without `record=True` it is None. Its arrays have the shape (time, component). The units
+are those of a spacecraft; a chain or a system has its own. Exclude rows without a length from sums and means:
+`jnp.mean(x, where=run.log.has_length)`.
 
 `u` is the delivered torque, and `commanded` is the commanded torque. They differ by limits, delay, lag and hardware
 errors of the actuators. `peak_torque` is the largest component of `commanded`, and `peak_torque_delivered` is the
