@@ -37,6 +37,9 @@ class Quantities(dict[str, float]):
         super().__init__(values)
         self._catalogue = catalogue
 
+    def __missing__(self, name: str) -> float:
+        raise KeyError(f"this run has no metric {name!r}, but it has {', '.join(self)}")
+
     def __repr__(self) -> str:
         return "\n".join(f"{name:24s} {value:12.5g} {self._catalogue[name].unit}" for name, value in self.items())
 

@@ -12,7 +12,7 @@ from ptsmc_jax.scenario import checks, custom, free_gains, layouts, mission, par
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.tables import Scenario, check_scenario
 from ptsmc_jax.scenario.values import Table
-from ptsmc_jax.simulation.gains import AXIS, base, gain_of_each_axis
+from ptsmc_jax.simulation.gains import AXIS, base, check_mapping, gain_of_each_axis
 
 TIME_AFTER_T_F = Scaled(10.0, time=1)  # default time from t_f to the end of a run [s]
 
@@ -162,8 +162,7 @@ def in_scenario(scenario: Scenario, gains: Mapping[str, Any]) -> Scenario:
         TypeError: `gains` is not a mapping.
     """
     scenario = to_scenario(scenario)
-    if not isinstance(gains, Mapping):
-        raise TypeError(f"gains are needed by name, such as {{'eta': 3.0}}, but this is a {type(gains).__name__}")
+    check_mapping(gains)
     axes = list(getattr(scenario.observer, "gain", ()))
     known_names = [*scenario.gains, *(f"{AXIS}{k + 1}" for k in range(len(axes)))]
     for name in gains:

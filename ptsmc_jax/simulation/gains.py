@@ -12,6 +12,7 @@ import numpy as np
 from jax import core
 from jaxtyping import Array
 
+from ptsmc_jax import declare
 from ptsmc_jax.numerics import paths
 from ptsmc_jax.simulation.assembly import Parts, check_parts
 
@@ -68,6 +69,12 @@ def _with_gain_at(parts: Parts, path: str, value: Any) -> Parts:
     return paths.put(parts, path, value)
 
 
+def check_mapping(gains: object) -> None:
+    """Raise TypeError if gains are not a mapping from names to values."""
+    if not isinstance(gains, Mapping):
+        raise TypeError(f"gains are needed by name, such as {{'eta': 3.0}}, but this is a {type(gains).__name__}")
+
+
 def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
     """Return the parts with other gains. `observer_gain` sets all axes; `t_f` moves the end of the run with it.
 
@@ -80,13 +87,16 @@ def with_gains(parts: Parts, gains: Mapping[str, Array | float]) -> Parts:
     Raises:
         ValueError: a name is unknown, a value is no finite number, or the clock of the parts has too few samples or
             steps for the new times. Under a JAX transformation the run has the status `incomplete` instead.
-        TypeError: the first argument is not the parts of a run.
+        TypeError: the first argument is not the parts of a run, or `gains` is not a mapping.
     """
     check_parts(parts)
+    check_mapping(gains)
     gain_paths = {"t_f": T_F, **paths_of(parts)}
     for name in gains:
         if name not in gain_paths:
-            raise ValueError(f"{name} is no gain of these parts; allowed are {', '.join(sorted(gain_paths))}")
+            is_number = name in declare.declared(type(parts.controller))
+            reason = ", because it is declared by ptsmc_jax.number" if is_number else ""
+            raise ValueError(f"{name} is no gain of these parts{reason}; allowed are {', '.join(sorted(gain_paths))}")
     numbers = {name: _convert_gain(name, value) for name, value in gains.items()}
     for name, path in gain_paths.items():  # gains of single axes are last, so that they override the gain of all axes
         if name in numbers:

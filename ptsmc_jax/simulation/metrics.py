@@ -350,8 +350,11 @@ class Metrics(dict[str, Any]):
 
     def __getattr__(self, name: str) -> Any:
         if name not in METRICS | pointing.METRICS:
-            raise AttributeError(f"there is no metric {name!r}")
+            raise AttributeError(f"there is no metric {name!r}; this run has {', '.join(self)}")
         return self[name] if name in self else np.nan * next(iter(self.values()))
+
+    def __missing__(self, name: str) -> Any:
+        raise KeyError(f"this run has no metric {name!r}, but it has {', '.join(self)}")
 
     def tree_flatten_with_keys(self) -> tuple[Iterable, tuple[str, ...]]:
         """Return the values with their keys, and the names."""

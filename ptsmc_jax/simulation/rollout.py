@@ -420,7 +420,10 @@ def _check_fit(parts: Parts) -> None:
     """Raise TypeError if the parts do not fit together."""
     check_parts(parts)
     for name, shape in parts.plant.state_shapes.items():
-        value = getattr(parts.initial, name, None) if name else parts.initial
+        if name and not hasattr(parts.initial, name):
+            names = ", ".join(parts.plant.state_shapes)
+            raise TypeError(f"initial must be a state with {names}, such as parts.initial._replace({name}=...)")
+        value = getattr(parts.initial, name) if name else parts.initial
         _check_shape(f"initial.{name}".rstrip("."), value, [shape])
     if not callable(parts.disturbance):
         raise TypeError(f"the disturbance must be a function of (t, x), but is {parts.disturbance!r}")

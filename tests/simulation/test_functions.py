@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import ptsmc_jax as ptsmc
-from ptsmc_jax import scenario
+from ptsmc_jax import explore, scenario
 from ptsmc_jax.dispersions.numbers import RandomNumbers
 from ptsmc_jax.dispersions.variation import Dispersion
 from ptsmc_jax.numerics import draws
@@ -125,6 +125,8 @@ REFUSED = [
      r"initial.w must be an array \(3,\), but is one of shape \(4,\)"),
     (lambda: ptsmc.simulate_parts(replace(RUN, initial=RUN.initial._replace(q=[0.0, 0.0, 0.0, 1.0]))),
      r"initial.q must be an array \(4,\), but is of type list"),
+    (lambda: ptsmc.simulate_parts(replace(RUN, initial=RUN.initial.q)),
+     r"initial must be a state with q, w, such as parts.initial._replace\(q=...\)"),
     (lambda: ptsmc.simulate_parts(replace(CHAIN, plant=LATE)), r"initial must be an array \(3,\), .* of shape \(2,\)"),
     (lambda: ptsmc.simulate_parts(replace(RUN, disturbance=lambda t, x: jnp.zeros(4))),
      r"the disturbance.s value must be an array \(3,\), but is one of shape \(4,\)"),
@@ -156,6 +158,9 @@ REFUSED = [
     (lambda: API.with_gains(RUN, {"eta": None}), "eta is None, but must be a number"),
     (lambda: API.with_gains(RUN, {"eta": 3j}), "eta is 3j, but must be a number"),
     (lambda: API.with_gains(RUN, {"eta": jnp.nan}), "eta is nan, but must be a finite number"),
+    (lambda: API.with_gains(RUN, [0.1]), r"gains are needed by name, such as \{'eta': 3.0\}, but this is a list"),
+    (lambda: API.with_gains(RUN, {"layer_time": 1.0}),
+     "layer_time is no gain of these parts, because it is declared by ptsmc_jax.number; allowed are delta, eta"),
     (lambda: API.chain(True), "order is True, but must be a whole number of at least 2"),
     (lambda: API.reach_of(FLIGHT, dlta=2.0), "there is no dlta in a reach; allowed are smallest_t_f, t_f, small"),
     (lambda: jax.eval_shape(lambda seed: draws.stream(seed, 0, "noise"), 0.5), "of type float64, but must be a whole"),
@@ -202,6 +207,11 @@ def test_metrics_print_only_metrics_that_the_run_has():
     assert float(shown["window_error"]) == pytest.approx(float(found.window_error), rel=1e-5)
     never = repr(ptsmc.Metrics({**found, "settling_time": jnp.asarray(jnp.nan)}))
     assert re.search("settling_time +nan", never)  # a run that never settles
+    with pytest.raises(AttributeError, match=r"there is no metric 'final_error'; this run has .*terminal_error"):
+        found.final_error  # noqa: B018
+    for named in (found, explore.Quantities(found, catalogues.CATALOGUE)):
+        with pytest.raises(KeyError, match=r"no metric 'final_error', but it has .*terminal_error"):
+            named["final_error"]
     many = jax.tree.map(lambda v: jnp.stack([v, v]), found)
     assert re.search(r"window_error +ArrayImpl \(2,\)", repr(many))
     jax.jit(lambda metrics: repr(metrics) and metrics)(found)
