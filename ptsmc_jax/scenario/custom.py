@@ -32,6 +32,8 @@ CODE_KEYS = ("system", "truth", "code")  # keys that name code, in any table
 DATA_FILE_KEY = "reference.file"  # key that names a data file
 CONTROLLER_OPTION = "--controller"  # option that names the exported C code, unlike the key `controller.code`
 REDECLARABLE_FIELD = "delta"  # field of the base class that a custom law may declare again, as a gain
+# entries of `gain_bounds.BOUNDS` that do not need other fields of a built-in part
+SHARED_BOUNDS = ("delta", "eta", "k1", "sign_width", "surface_rate", "dead_beat")
 Code = Annotated[Any, Meta(description=systems.NAME_FORMS), Meaning("the class")]
 
 
@@ -253,6 +255,12 @@ def _declaration(table: Any, custom_class: type, field: dataclasses.Field) -> De
             raise ValueError(
                 f"the gain {field.name} of the class {custom_class.__name__} has no bounds; allowed is "
                 "ptsmc_jax.gain(.., usual=(lower, upper))"
+            )
+        if isinstance(declared.usual, str) and declared.usual not in SHARED_BOUNDS:
+            raise ValueError(
+                f"the usual bounds of the gain {field.name} of the class {custom_class.__name__} are "
+                f"{show(declared.usual)}, but must be two numbers, a function of t_f and the control period, or one of "
+                f"{', '.join(map(show, SHARED_BOUNDS))}"
             )
     return declared
 

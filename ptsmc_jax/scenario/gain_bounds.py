@@ -106,14 +106,15 @@ def _declared_bounds(declared: Declaration, gain_name: str) -> GainBounds:
 
     def interval(context: BoundsContext) -> Interval:
         try:
-            bounds: Any = usual(context.t_f, context.scenario.loop.period) if callable(usual) else usual
-            low, high = (float(end) for end in bounds)
+            stated: Any = usual(context.t_f, context.scenario.loop.period) if callable(usual) else usual
+            bounds = tuple(map(float, stated))
         except (Exception, SystemExit) as error:
             reason = f"{type(error).__name__}: {error}"
             raise ScenarioError(f"the usual bounds of the {gain_name} fail: {reason}") from None
+        low, high = bounds if len(bounds) == 2 else (math.nan, math.nan)
         if not (limits.above < low < high < limits.below and limits.at_least <= low and high <= limits.at_most):
             raise ScenarioError(
-                f"the usual bounds of the {gain_name} are [{low:g}, {high:g}], but must be two "
+                f"the usual bounds of the {gain_name} are [{', '.join(f'{end:g}' for end in bounds)}], but must be two "
                 f"numbers{limits.words()}, the lower one first"
             )
         return low, high
@@ -154,7 +155,10 @@ def _usual_delta(context: BoundsContext) -> Interval:
 def _usual_k1(context: BoundsContext) -> Interval:
     """Return K1 from the slowest decay to the stability limit, for the smallest c if c is free."""
     lowest = SLOWEST_DECAY * context.slowest_rate
-    rate = context.smallest_value("surface_rate") if "surface_rate" in context.free else context.law.surface_rate
+    if "surface_rate" in context.free:
+        rate = context.smallest_value("surface_rate")
+    else:  # a custom law may have no c, see `Law.noise_of_s`
+        rate = getattr(context.law, "surface_rate", 1.0 / context.t_f)
     largest = scales.largest_k1(context.scenario, rate) if context.sampled else 0.0
     return lowest, largest if largest > lowest else 100.0 * lowest
 

@@ -335,6 +335,10 @@ CHANGED = [
     # an earlier error named tune.bounds.eta, which is not in the file
     ("(2.1, 6.0)", "(2.0, 6.0)", "usual bounds of the gain eta of the class Mine are [2, 6]", "numbers greater than 2"),
     ("lambda t_f, h: (1.0 / t_f, 0.5 / h)", "lambda t_f: 1.0", "usual bounds of the gain k1", "TypeError"),
+    ("(2.1, 6.0)", "(2.1, 4.0, 6.0)", "usual bounds of the gain eta of the class Mine are [2.1, 4, 6]", "two numbers"),
+    # an earlier version ended in a KeyError, or in an AttributeError if the name belongs to a law with other fields
+    *(("(2.1, 6.0)", f'"{name}"', f'the gain eta of the class Mine are "{name}"', '"eta", "k1", "sign_width"')
+      for name in ("etta", "fixed_time_p")),
     ("gain(3.0,", "gain(1.0,", "the default of eta is 1", "a number greater than 2"),
     ("width: float = 1e-3", "width: str = 'x'", 'the default of width is "x"', "one number or several"),
     ("width: float = 1e-3", "width: float", "cannot have such fields", "width"),
