@@ -68,7 +68,7 @@ def _check_table(scenario: Scenario, tune: tables.Tune) -> None:
     if len(set(free)) < len(free):
         raise wrong("tune.free", free, "a list that names each gain once")
     if not set(free) <= {*tables.TUNABLE_GAINS, *scenario_gains}:
-        raise wrong("tune.free", free, tables.FREE_ALLOWED)
+        raise wrong("tune.free", free, f"a list of some of {', '.join(scenario_gains)}")
     beginning = f"tune.free is {errors.brief(free)}, but"
     for name in free:
         if name not in scenario_gains:
@@ -124,8 +124,7 @@ def _absence_reason(scenario: Scenario, name: str) -> str:
         "filter_bandwidth": 'there is no filter; allowed is filter_bandwidth with [filter] of kind "steady_state"',
         "command_corner": "the command is not filtered; allowed is command_corner with hardware.command_filter",
     }
-    gains = dict.fromkeys((*scenario.controller.gains, *scenario.observer.gains, *others))
-    law_reason = f"the law of controller.kind = {law} has no {name}; allowed is some of {', '.join(gains)}"
+    law_reason = f"the law of controller.kind = {law} has no {name}; allowed is some of {', '.join(scenario.gains)}"
     return others.get(name, law_reason)
 
 

@@ -472,6 +472,15 @@ def test_custom_code_that_exits_is_a_configuration_error(command, here):
     assert not (here / "out").exists()
 
 
+def test_an_unknown_free_gain_is_refused_with_the_gains_of_the_scenario(here):
+    """Earlier, the message listed the gains of all built-in laws and not those of the custom law."""
+    (here / "mine.py").write_text(HEAD + LAW)
+    with pytest.raises(ScenarioError, match=r'"etta"\], but must be a list of some of delta, eta, k1, t_f$'):
+        scenario.study(scenario.from_tables({**CHAIN, "controller": MINE, "tune": {"free": ["k1", "etta"]}}))
+    with pytest.raises(ScenarioError, match=r"has no k_p; allowed is some of delta, eta, k1, t_f$"):
+        scenario.study(scenario.from_tables({**CHAIN, "controller": MINE, "tune": {"free": ["k_p"]}}))
+
+
 def test_a_scenario_without_gains_is_refused_before_a_search(command, here):
     (here / "mine.py").write_text(HEAD + LAW.split("    eta:")[0] + "    def acceleration(self, now, error, *_):\n"
                                   "        return -error, error\n")  # fmt: skip
