@@ -231,6 +231,10 @@ NUMBERS = {
         (("simulate", "--sed", "1"), ("--sed", "--seed")),
         (("simulate", "--loud"), ("--loud",)),
         (("tune", "--trial", "1"), ("--trial",)),
+        (("tune", "--steps=4"), ("tune does not take --steps; set tune.steps in the scenario",)),
+        (("compare", "s.toml", "--trials", "10"), ("set tune.trials in the scenario",)),  # earlier: "--trust?"
+        (("compare", "s.toml", "--against", "pd,scaling"), ("is pd,scaling", "repeat the option for several laws")),
+        (("compare", "s.toml", "--against", "prescribed_time"), ("prescribed_time is always compared",)),
         (("simulate", "--quiet=perhaps"), ("--quiet", "perhaps")),
         (("simulate", "s.toml", "t.toml"), ("simulate does not take t.toml", "ptsmc simulate --help")),
         (("montecarl", "s.toml"), ("montecarl", "simulate, reproduce, map, margins, tune")),

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import App, CycloptsError, Parameter
-from cyclopts.exceptions import UnusedCliTokensError
+from cyclopts.exceptions import UnknownOptionError, UnusedCliTokensError
 
 import ptsmc_jax
 from tuning.cli import INTERRUPTED, campaign_commands, identify_command, searches, writing_commands
@@ -291,7 +291,8 @@ def compare(
         tuple[str, ...] | None,
         Parameter(
             help="Law to compare with: pd, terminal, fixed_time, time_base_pd, time_base_sliding, scaling, "
-            "predefined_time, super_twisting; repeat the option for several. Default: all of them.",
+            "predefined_time, super_twisting; repeat the option for several. Default: all of them. The prescribed-time "
+            "law is always compared.",
         ),
     ] = None,
     law: Annotated[tuple[str, ...], Parameter(show_default=False)] = (),
@@ -367,6 +368,8 @@ def main() -> None:
         status = INTERRUPTED
     except UnusedCliTokensError as error:
         _fail(_describe_unused_arguments(error))
+    except UnknownOptionError as error:
+        _fail(_describe_unknown_option(error))
     except CycloptsError as error:
         refused = error.__cause__
         _fail(str(refused) if isinstance(refused, UsageError) else " ".join(str(error).split()))
@@ -379,6 +382,19 @@ def main() -> None:
         if (programs := sys.modules.get("ptsmc_jax.programs")) is not None:
             programs.cancel_prepared()  # exiting waits for compilations
     sys.exit(status if isinstance(status, int) else 0)
+
+
+def _describe_unknown_option(error: UnknownOptionError) -> str:
+    """Return the message about an option that a command does not have. It may be a key of the table [tune]."""
+    command = " ".join(error.command_chain or ())
+    option = (error.token.keyword or error.token.value).partition("=")[0]
+    if command in searches.COMMANDS:
+        from ptsmc_jax.scenario.tables import Tune
+
+        key = option.removeprefix("--").replace("-", "_")
+        if key in Tune.__struct_fields__:
+            return f"{command} does not take {option}; set tune.{key} in the scenario"
+    return " ".join(str(error).split())
 
 
 def _describe_unused_arguments(error: UnusedCliTokensError) -> str:

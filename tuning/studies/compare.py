@@ -102,7 +102,8 @@ class Rivals:
         others = law_kinds()[1:]
         for kind in self.kinds or ():
             if kind not in others:
-                raise UsageError(f"--against is {kind}, but must be one of {', '.join(others)}")
+                allowed = f"one of {', '.join(others)}; repeat the option for several laws"
+                raise UsageError(f"--against is {kind}, but must be {allowed} ({OURS} is always compared)")
         for location in self.custom:
             try:
                 file, _ = systems.split_name(location, systems.NAME_FORMS)
