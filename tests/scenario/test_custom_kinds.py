@@ -461,6 +461,14 @@ def test_late_errors_in_custom_code_are_one_sentence(command, here, monkeypatch)
     assert systems.find_faulty_file(no_slopes.value) == str(here / "mine.py")
 
 
+def test_an_absent_file_is_refused_and_not_reported_as_run(command, here):
+    (here / "s.toml").write_text(SHORT_CUSTOM.replace("mine.py", "my/laws.py"))
+    code, _, error = command("simulate", "s.toml")
+    assert code == 2
+    assert error.count("\n") == 1
+    assert f"the file {here}/my/laws.py does not exist" in error
+
+
 def test_custom_code_that_exits_is_a_configuration_error(command, here):
     """An earlier version ended with the status of the custom code, 0, which means that all requirements are met."""
     late = LAW.replace("        left =", "        asked.append(0)\n        if len(asked) > 4: exit(0)\n        left =")

@@ -160,6 +160,8 @@ def is_self_contained(file: Path) -> bool:
 
 def _report_custom_code(programs: Mapping[str, str], source: Path) -> None:
     for file, keys in _group_by_file(programs).items():
+        if os.path.isabs(file) and not os.path.exists(file):
+            continue  # the command refuses an absent file
         *first, last = keys
         name = f"{', '.join(first)} and {last} of {source} name" if first else f"{last} of {source} names"
         print(f"ptsmc: runs {file}, which {name}", file=sys.stderr)
