@@ -30,15 +30,19 @@ MAX_TURN = 1.0  # largest turn in one control period [rad]; for real spacecraft 
 MAX_ATTITUDE_NOISE = np.deg2rad(5.0)
 
 
-def warnings(scenario: Scenario) -> list[str]:
+def warnings(scenario: Scenario, *, tuned: bool = False) -> list[str]:
     """Return the warnings of a scenario, one sentence each.
 
     Bounds and estimate are not examined if custom code that defines the disturbance has not run yet.
+
+    Args:
+        scenario: the scenario.
+        tuned: whether a search found the free gains of the scenario.
     """
-    bounds = disturbance_tables.largest_disturbance(scenario)
-    bound_warnings = (
-        () if bounds is None else (*_implausible_bound(scenario, *bounds), *_noisy_estimate(scenario, bounds[0]))
-    )
+    bounds, bound_warnings = disturbance_tables.largest_disturbance(scenario), list[str]()
+    if bounds is not None:
+        tuned = tuned and "observer_gain" in scenario.search.gains
+        bound_warnings = [*_implausible_bound(scenario, *bounds), *_noisy_estimate(scenario, bounds[0], tuned=tuned)]
     checks = (
         _implausible_inertia,
         _implausible_noise,
@@ -231,10 +235,16 @@ def _implausible_bound(scenario: Scenario, bound: float, rate_bound: float) -> I
         )
 
 
-def _noisy_estimate(scenario: Scenario, disturbance_bound: float) -> Iterator[str]:
+def _noisy_estimate(scenario: Scenario, disturbance_bound: float, *, tuned: bool) -> Iterator[str]:
     """Warn about an observer whose estimate has more noise than the disturbance has amplitude.
 
-    The default gain is as small as is useful, see `mission.design`, so only a larger gain causes the warning.
+    The default gain is as small as is useful, see `mission.design`, so only a larger gain causes the warning. A search
+    has already tried smaller gains.
+
+    Args:
+        scenario: the scenario.
+        disturbance_bound: largest component of the disturbance [N m].
+        tuned: whether a search found the observer gain.
     """
     noise = estimate_noise(scenario)
     if noise > disturbance_bound > 0.0:
@@ -246,7 +256,7 @@ def _noisy_estimate(scenario: Scenario, disturbance_bound: float) -> Iterator[st
         yield (
             f"observer.gain is {shown}: the noise of its estimate, "
             f"{noise:.2g}{unit} (1 sigma), is larger than the disturbance, at most {disturbance_bound:.3g}{unit}; "
-            'try a smaller gain, or observer.kind = "none"'
+            f'try {"" if tuned else "a smaller gain, or "}observer.kind = "none"'
         )
 
 

@@ -363,6 +363,27 @@ def test_scenario_that_a_law_cannot_control_is_refused_before_any_search(monkeyp
     assert not asked
 
 
+def test_a_warning_names_its_laws_unless_it_concerns_all_of_them(eight):
+    """Earlier, two laws had nearly the same line without a name, and the advice to reduce a gain that was tuned."""
+    quiet = scenario.replace(scenario.from_tables(TABLES), disturbance={"kind": "constant", "amplitude": [1e-6, 0, 0]})
+    noisy = scenario.replace(quiet, hardware__rate_noise=1e-2, tune={"trials": 8})
+    gains_by_law = {"published": 20.0, compare.OURS: 30.0, "pd": 40.0, "scaling": 40.0}
+
+    def warnings(gains):
+        made = {law: replace(contender(eight), simulated=scenario.replace(noisy, observer__gain=[gain] * 3))
+                for law, gain in gains.items()}  # fmt: skip
+        return [text for text in compare.summary(compare.Comparison(made, 0, False))["warnings"] if "noise" in text]
+
+    published, ours, others = warnings(gains_by_law)
+    assert published.startswith("published gains: observer.gain is [20.0,")
+    assert published.endswith('try a smaller gain, or observer.kind = "none"')
+    assert ours.startswith("prescribed_time: observer.gain is [30.0,")
+    assert others.startswith("pd, scaling: observer.gain is [40.0,")
+    assert others.endswith('; try observer.kind = "none"')
+    (same,) = warnings(dict.fromkeys([compare.OURS, "pd"], 40.0))
+    assert same.startswith("observer.gain is [40.0,")
+
+
 def lines_of(summary):
     return list(compare_report.gain_lines(summaries.read(summaries.Compare, summary)))
 

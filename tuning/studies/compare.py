@@ -356,10 +356,17 @@ def summary(comparison: Comparison) -> dict[str, Any]:
         "judged_on": "flight clock",  # no sign function is named here, because the laws have different ones
         "settling_angle": first.simulated.loop.settling_angle,
         "laws": {law: contender_results(contender) for law, contender in results.items()},
-        "warnings": list(
-            dict.fromkeys(text for contender in results.values() for text in plausibility.warnings(contender.simulated))
-        ),
+        "warnings": _warnings_by_law(results),
     }
+
+
+def _warnings_by_law(results: Mapping[str, Contender]) -> list[str]:
+    """Return the warnings of all laws. A warning names its laws if it does not concern all of them."""
+    laws_by_text: dict[str, list[str]] = {}
+    for law, contender in results.items():
+        for text in plausibility.warnings(contender.simulated, tuned=law != PUBLISHED):
+            laws_by_text.setdefault(text, []).append("published gains" if law == PUBLISHED else law)
+    return [text if len(laws) == len(results) else f"{', '.join(laws)}: {text}" for text, laws in laws_by_text.items()]
 
 
 def write(

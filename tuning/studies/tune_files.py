@@ -96,7 +96,7 @@ def summary(tuning: Tuning) -> dict[str, object]:
         "broken_by": tuning.broken_by,
         "verdicts": [verdict.in_summary() for verdict in tuning.verdicts],
         "judged_on": judging.describe_simulation(tuning.tuned),
-        "warnings": plausibility.warnings(tuning.tuned),
+        "warnings": plausibility.warnings(tuning.tuned, tuned=True),
         "search": {
             "objective": objective_name(tuning.tuned.search),
             "minimise": tuning.tuned.search.minimise,
