@@ -384,6 +384,22 @@ def test_a_warning_names_its_laws_unless_it_concerns_all_of_them(eight):
     assert same.startswith("observer.gain is [40.0,")
 
 
+def test_plain_numbers_of_a_custom_law_cause_a_warning(eight, tmp_path, monkeypatch):
+    """Earlier, a law without any gain was compared without being tuned, and nothing reported it."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own.py").write_text(
+        "import ptsmc_jax as ptsmc\n\n\nclass Plain(ptsmc.AccelerationLaw):\n"
+        "    k_p: float = 0.2\n    k_d: float = 1.0\n    k_i: float = ptsmc.gain(0.1, (0.01, 1.0))\n"
+        "    floor: float = ptsmc.number(0.1)\n    axis: tuple = (1.0, 0.0, 0.0)\n\n"
+        "    def acceleration(self, now, error, error_rate, bound):\n"
+        "        return -self.k_p * error - self.k_d * error_rate, error\n"
+    )
+    posed = compare.contenders(scenario.from_tables(TABLES), compare.Rivals(("pd",), ("own.py:Plain",)))
+    made = {law: replace(contender(eight), simulated=one) for law, one in posed.items()}
+    (warning,) = compare.summary(compare.Comparison(made, 0, False))["warnings"]
+    assert warning.startswith("Plain: the search does not tune k_p, k_d, because they are plain numbers")
+
+
 def lines_of(summary):
     return list(compare_report.gain_lines(summaries.read(summaries.Compare, summary)))
 

@@ -319,13 +319,19 @@ def compare(
     comparing.check(loaded)
     loaded = posing.with_tune(loaded)
     contenders = functools.cache(lambda: comparing.validated_contenders(loaded, rivals))
+
+    def check() -> None:
+        for name, contender in contenders().items():
+            for text in comparing.warn_about_plain_numbers(contender):
+                print(f"ptsmc: {name}: {text}", file=sys.stderr)
+
     identity = comparing.identity(loaded, seed, rivals) | {"device": device}
     search = searches.LongSearch(
         identity,
         objective_name(loaded.search),
         work=lambda report, journal: comparing.compare(loaded, seed, report, journal, contenders()),
         write=lambda staging, comparison: comparing.write(staging, loaded, comparison, common.figures, identity),
-        check=contenders,
+        check=check,
     )
     return searches.run(search, loaded, folder, force=common.force, quiet=common.quiet)
 

@@ -360,11 +360,29 @@ def summary(comparison: Comparison) -> dict[str, Any]:
     }
 
 
+def warn_about_plain_numbers(scenario: Scenario) -> Iterator[str]:
+    """Warn about numbers of a custom law that are probably gains, but are not declared with `gain` or `number`."""
+    table = scenario.controller
+    fields = dataclasses.fields(table.part_class) if table.kind == "custom" else ()
+    names = [
+        field.name
+        for field in fields
+        if field.name in table.declared and not field.metadata and not isinstance(field.default, tuple)
+    ]
+    if names:
+        is_plain = "it is a plain number" if len(names) == 1 else "they are plain numbers"
+        yield (
+            f"the search does not tune {', '.join(names)}, because {is_plain} of the class; declare gains with "
+            "ptsmc_jax.gain, and other numbers with ptsmc_jax.number"
+        )
+
+
 def _warnings_by_law(results: Mapping[str, Contender]) -> list[str]:
     """Return the warnings of all laws. A warning names its laws if it does not concern all of them."""
     laws_by_text: dict[str, list[str]] = {}
     for law, contender in results.items():
-        for text in plausibility.warnings(contender.simulated, tuned=law != PUBLISHED):
+        texts = plausibility.warnings(contender.simulated, tuned=law != PUBLISHED)
+        for text in (*texts, *warn_about_plain_numbers(contender.simulated)):
             laws_by_text.setdefault(text, []).append("published gains" if law == PUBLISHED else law)
     return [text if len(laws) == len(results) else f"{', '.join(laws)}: {text}" for text, laws in laws_by_text.items()]
 
