@@ -26,7 +26,7 @@ def tune(search: dict[str, Any] | None = None, trust: dict[str, Any] | None = No
     known = {"influence": {}, "margins": None, "gradient_error": {"start": 1e-9, "end": 1e-9}}
     summary = {
         "status": "met", "plant": "spacecraft", "gain_units": {}, "gains": {}, "at_bound": {},
-        "accuracy_gain_over_published": None, "accuracy_gain_interval": None, "training": group(), "held_out": group(),
+        "widened_bounds": {}, "accuracy_gain_over_published": None, "accuracy_gain_interval": None, "training": group(), "held_out": group(),
         "published_unavailable": None, "published_label": "published", "shortest_t_f": None, "broken_by": {},
         "verdicts": [],
         "judged_on": "flight clock", "warnings": [], "differential_evolution": None,
@@ -48,7 +48,7 @@ def law(**changes: Any) -> dict[str, Any]:
     """Return a law of a comparison without numbers."""
     numbers = ("window_error", "window_error_interval", "lower_bound", "peak_torque", "largest_peak_torque", "effort",
                "chattering", "settling_time", "settling_near_far", "margins")  # fmt: skip
-    return {**dict.fromkeys(numbers), "gains": {}, "gain_units": {}, "at_bound": {}, "met": True,
+    return {**dict.fromkeys(numbers), "gains": {}, "gain_units": {}, "at_bound": {}, "widened_bounds": {}, "met": True,
             "counts": {"ok": 8}, "unsettled": 0, "model_errors": {}, "verdicts": [], **changes}  # fmt: skip
 
 

@@ -240,6 +240,7 @@ TUNINGS: dict[str, Callable[[], Any]] = {
     "gradients are not checked": lambda: diagnostics(gradient_error={"start": None, "end": None}),
     "gradients are checked at the start": lambda: diagnostics(gradient_error={"start": 1e-9, "end": None}),
     "wrong gradients": lambda: diagnostics(gradient_error={"start": 3.0, "end": 2.0}),
+    "wider bounds": lambda: tune_report.diagnostic_lines(examples.tune(widened_bounds={"k1": (0.1, 1234.56)})),
     "no trial ends": lambda: diagnostics({"eta": "upper"}, influence={"eta": "unknown", "delta": "unknown"}),
     "too few training trials": lambda: fitted(2.36),
     "enough training trials": lambda: fitted(2.0),

@@ -266,7 +266,7 @@ def eight():
 def contender(trials, **changes):
     base = scenario.from_tables(TABLES)
     verdicts = judging.verdicts_of(base, trials, 0)
-    return compare.Contender(base, {}, {}, trials, changes.get("verdicts", verdicts), None)
+    return compare.Contender(base, {}, {}, {}, trials, changes.get("verdicts", verdicts), None)
 
 
 def changed(trials, status, **metrics):
@@ -304,8 +304,8 @@ def rivals(monkeypatch, eight, interrupt=None):
         assert tries == 1  # more tries would judge on different trials
         law = posed.controller.kind
         asked.append(("tune", law, seed))
-        return SimpleNamespace(tuned=posed, gains={}, at_bound={}, held_out={"tuned": eight}, verdicts=[],
-                               lower_bounds={"tuned": None},
+        return SimpleNamespace(tuned=posed, gains={}, at_bound={}, widened_bounds={}, held_out={"tuned": eight},
+                               verdicts=[], lower_bounds={"tuned": None},
                                search=SimpleNamespace(interrupted=law == interrupt, problem=None))  # fmt: skip
 
     def judge(simulated, seed):
@@ -416,6 +416,7 @@ def test_required_margins_appear_in_table_csv_file_and_report(eight, tmp_path):
     }  # fmt: skip
     nominal = {"gain_margin": 8.5, "phase_margin": 40.0, "delay_margin": 0.4, "peak_sensitivity": 3.0}
     made["published"] = replace(made["published"], margins={"hold": nominal})
+    made[compare.OURS] = replace(made[compare.OURS], widened_bounds={"delta": (0.1, 4.0)})
     found = compare.Comparison(made, 0, False)
     (tmp_path / "out").mkdir()
     compare.write(tmp_path / "out", base, found, False, compare.identity(base, 0))
@@ -439,7 +440,8 @@ def test_required_margins_appear_in_table_csv_file_and_report(eight, tmp_path):
         assert "  gain_margin at least 6 dB: worst of 2 dispersed loops 5.04 dB: NOT met in 1 of 2 loops" in lines
         assert "  gain_margin at least 6 dB: no worst value: NOT met in 1 of 2 loops" in lines
         assert not [line for line in lines if "delay_margin" in line]
-        assert "prescribed time: delta 0.5 s" in lines
+        moved = "  the search moved the default bounds of delta to 0.1 and 4"
+        assert lines[lines.index("prescribed time: delta 0.5 s") + 1] == moved
         assert lines[-1] == "a trial has settled when its angle stays below 206 arcsec"
     assert "no law meets every requirement" in page.build(tmp_path / "out")
     assert not [line for line in lines_of(compare.summary(found)) if "interrupted" in line]

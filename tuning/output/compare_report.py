@@ -17,6 +17,7 @@ from tuning.output.formats import (
     list_counts,
     list_gains,
     ratio_to_bound,
+    widened_lines,
 )
 from tuning.output.report import Block, Chart, Report, Section, Table, Text, warning_lines
 from tuning.output.summaries import Compare, Interval, Law, Number
@@ -266,6 +267,7 @@ def gain_lines(summary: Compare) -> Iterator[str]:
             else ""
         )
         yield f"{_readable_name(name)}{scaled}: {gains}{bound}"
+        yield from (f"  {line}" for line in widened_lines(law.widened_bounds))
         failures = failed_counts(law.counts)
         if failures:
             yield f"  {sum(failures.values())} of {summary.trials} trials fail: {list_counts(failures)}"

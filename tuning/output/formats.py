@@ -1,7 +1,7 @@
 """Numbers, units and counts as text."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 
 def format_number(value: float | None, format_spec: str, none: str = "-") -> str:
@@ -168,6 +168,16 @@ def heading(name: str, unit: str) -> str:
     ('delay_margin [s]', 'saturated', 'status')
     """
     return f"{name} [{unit}]" if unit.strip("-") else name
+
+
+def widened_lines(bounds: Mapping[str, tuple[float, float]]) -> Iterator[str]:
+    """Return lines with the default bounds that a search moved.
+
+    >>> list(widened_lines({"k_p": (0.01, 100.0)}))
+    ['the search moved the default bounds of k_p to 0.01 and 100']
+    """
+    for gain, (low, high) in bounds.items():
+        yield f"the search moved the default bounds of {gain} to {low:.4g} and {high:.4g}"
 
 
 def list_gains(gains: Mapping[str, float], units: Mapping[str, str], digits: str) -> str:

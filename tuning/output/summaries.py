@@ -115,6 +115,7 @@ class Tune(msgspec.Struct, frozen=True, kw_only=True):
     gain_units: dict[str, str]
     gains: dict[str, float]
     at_bound: dict[str, str]
+    widened_bounds: dict[str, tuple[float, float]]  # default bounds that the search moved, by gain
     accuracy_gain_over_published: Number
     accuracy_gain_interval: Interval
     training: Group
@@ -139,6 +140,7 @@ class Law(msgspec.Struct, frozen=True, kw_only=True):
     gains: dict[str, float]
     gain_units: dict[str, str]
     at_bound: dict[str, str]
+    widened_bounds: dict[str, tuple[float, float]]  # default bounds that the search moved, by gain
     met: bool
     counts: dict[str, int]
     window_error: Number

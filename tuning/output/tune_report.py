@@ -17,6 +17,7 @@ from tuning.output.formats import (
     in_readable_unit,
     list_counts,
     ratio_to_bound,
+    widened_lines,
 )
 from tuning.output.report import Report, Section, Table, Text
 from tuning.output.summaries import Entry, Group, Row, Search, Tune
@@ -341,6 +342,7 @@ def diagnostic_lines(summary: Tune) -> Iterator[str]:
     for gain, influence_text in influence.items():
         if influence_text == "none":
             yield f"{gain} has no influence: objective and limits change by less than 1 % between its bounds"
+    yield from widened_lines(summary.widened_bounds)
     unknown = ", ".join(gain for gain, influence_text in influence.items() if influence_text == "unknown")
     if unknown:
         yield f"the influence of {unknown} is unknown: no training trial reaches its end between the bounds"

@@ -47,6 +47,7 @@ class Contender:
     simulated: Scenario
     gains: dict[str, float]
     at_bound: dict[str, str]
+    widened_bounds: dict[str, tuple[float, float]]
     trials: Trials
     verdicts: list[Verdict]
     lower_bound: float | None  # lower bound of the RMS window error
@@ -261,14 +262,16 @@ def compare(
         verdicts = judging.verdicts_of(simulated, trials, held_out_seed)
         lower_bound = judging.rms_lower_bound(simulated, held_out_seed)
         published_gains = gains.gains_of(study(simulated).parts)
-        published = Contender(simulated, published_gains, {}, trials, verdicts, lower_bound)
+        published = Contender(simulated, published_gains, {}, {}, trials, verdicts, lower_bound)
         results[PUBLISHED] = _add_margins_and_model_errors(published, held_out_seed)
     for number, (law, candidate) in enumerate(rivals.items(), 1):
         law_report = headed(report, f"{law}, law {number} of {len(rivals)}")
         # more tries would judge the laws on different held-out trials
         tuned = tuner.tune(candidate, seed, law_report, journal, with_checks=False, tries=1)
         held_out, lower_bound = tuned.held_out["tuned"], tuned.lower_bounds["tuned"]
-        results[law] = Contender(tuned.tuned, tuned.gains, tuned.at_bound, held_out, tuned.verdicts, lower_bound)
+        results[law] = Contender(
+            tuned.tuned, tuned.gains, tuned.at_bound, tuned.widened_bounds, held_out, tuned.verdicts, lower_bound
+        )
         interrupted = tuned.search.interrupted
         if interrupted:
             break
@@ -295,6 +298,7 @@ def contender_results(contender: Contender) -> dict[str, object]:
         "gains": contender.gains,
         "gain_units": gains.units_of(contender.simulated, contender.gains),
         "at_bound": contender.at_bound,
+        "widened_bounds": contender.widened_bounds,
         "met": contender.met,
         "counts": trials.counts(),
         "window_error": error,

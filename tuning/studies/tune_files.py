@@ -85,6 +85,7 @@ def summary(tuning: Tuning) -> dict[str, object]:
         "gain_units": gain_names.units_of(tuning.tuned, itertools.chain(*tuning.judged_gains.values())),
         "gains": tuning.gains,
         "at_bound": tuning.at_bound,
+        "widened_bounds": tuning.widened_bounds,
         **_accuracy_gain(tuning.held_out),
         "interval_confidence": trust.CONFIDENCE,
         "training": {"seed": tuning.seed, **statistics(tuning.training, kind)},

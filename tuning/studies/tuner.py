@@ -91,6 +91,9 @@ class Tuning(_Judged):
     """The results of a tuning run, which may have been interrupted."""
 
     at_bound: dict[str, str]
+    widened_bounds: dict[
+        str, tuple[float, float]
+    ]  # default bounds that the search moved, see `_search_in_wider_bounds`
     training: Trials  # tuned gains on the training trials
     held_out: dict[str, Trials]  # held-out trials: "tuned" and the keys of `judging.reference_scenarios`
     published_unavailable: str | None  # reason why the published gains cannot be simulated
@@ -149,8 +152,9 @@ def tune(
     report("compiling", 0, 0, np.nan, 0.0)
     setup = posing.set_up_tuning(scenario, seed, journal)
     references, published_error = judging.reference_scenarios(scenario)
+    first_bounds = setup.ready.scenario.search.bounds
     judged, setup = _search_and_judge(scenario, setup, journal, report, tries)
-    evaluate = setup.evaluate
+    evaluate, last_bounds = setup.evaluate, setup.ready.scenario.search.bounds
     outcome, rollouts, gradients = judged.search, evaluate.rollouts, evaluate.gradients
     check = None
     if with_global_check and not outcome.interrupted:
@@ -174,6 +178,7 @@ def tune(
     return Tuning(
         **vars(judged),
         at_bound=at_bound,
+        widened_bounds={name: bounds for name, bounds in last_bounds.items() if bounds != first_bounds[name]},
         training=training,
         held_out=held_out,
         published_unavailable=published_error,
