@@ -26,7 +26,8 @@ def tune(search: dict[str, Any] | None = None, trust: dict[str, Any] | None = No
     known = {"influence": {}, "margins": None, "gradient_error": {"start": 1e-9, "end": 1e-9}}
     summary = {
         "status": "met", "plant": "spacecraft", "gain_units": {}, "gains": {}, "at_bound": {},
-        "widened_bounds": {}, "accuracy_gain_over_published": None, "accuracy_gain_interval": None, "training": group(), "held_out": group(),
+        "widened_bounds": {}, "accuracy_gain_over_published": None, "accuracy_gain_interval": None,
+        "training": group(), "held_out": group(),
         "published_unavailable": None, "published_label": "published", "shortest_t_f": None, "broken_by": {},
         "verdicts": [],
         "judged_on": "flight clock", "warnings": [], "differential_evolution": None,

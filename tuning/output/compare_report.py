@@ -169,13 +169,16 @@ def build(summary: Compare) -> Report:
         for question in QUESTIONS
         if _has_answer(question, summary.laws)
     ]
-    method = (
-        "the same search tuned each law in all of its gains, the scenario's own law in those of tune.free; results on "
-        f"{format_count(summary.trials, 'held-out trial')}, {summary.judged_on}"
-    )
+    method = [
+        "the same search tuned all gains of each law; if the scenario has tune.free, the search tuned only these gains "
+        "of the scenario's law",
+        f"results on {format_count(summary.trials, 'held-out trial')}, sampled at whole control periods from t = 0 "
+        f"({summary.judged_on})",
+    ]
     sections.append(Section("Gains", [Text(list(gain_lines(summary)))]))
     mood = "good" if summary.status == "met" else "bad"
-    return Report(headline, mood, [most_accurate_law(summary.laws), method, *warning_lines(summary.warnings)], sections)
+    lines = [most_accurate_law(summary.laws), *method, *warning_lines(summary.warnings)]
+    return Report(headline, mood, lines, sections)
 
 
 def _has_answer(question: Question, laws: dict[str, Law]) -> bool:
@@ -262,7 +265,7 @@ def gain_lines(summary: Compare) -> Iterator[str]:
         gains = list_gains(law.gains, law.gain_units, ".4g")
         bound = "".join(f"; {gain} on its {side} bound" for gain, side in law.at_bound.items())
         scaled = (
-            ", scaled to this body and period"
+            " of the paper, scaled to this body and period"
             if (name, summary.published_label) == ("published", "published, scaled")
             else ""
         )
