@@ -384,7 +384,9 @@ def test_a_warning_names_its_laws_unless_it_concerns_all_of_them(eight):
     assert same.startswith("observer.gain is [40.0,")
 
 
-def test_plain_numbers_of_a_custom_law_cause_a_warning(eight, tmp_path, monkeypatch):
+def test_plain_numbers_of_a_custom_law_cause_a_warning_before_and_after_the_search(
+    command, eight, tmp_path, monkeypatch
+):
     """Earlier, a law without any gain was compared without being tuned, and nothing reported it."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "own.py").write_text(
@@ -398,6 +400,15 @@ def test_plain_numbers_of_a_custom_law_cause_a_warning(eight, tmp_path, monkeypa
     made = {law: replace(contender(eight), simulated=one) for law, one in posed.items()}
     (warning,) = compare.summary(compare.Comparison(made, 0, False))["warnings"]
     assert warning.startswith("Plain: the search does not tune k_p, k_d, because they are plain numbers")
+
+    def stop(*_):
+        raise UsageError("the search begins")
+
+    monkeypatch.setattr(compare, "compare", stop)
+    (tmp_path / "s.toml").write_text(SHORT)
+    status, _, error = command("compare", "s.toml", "--against", "pd", "--law", "own.py:Plain")
+    assert status == 2
+    assert error.splitlines()[-2:] == [f"ptsmc: {warning}", "ptsmc: the search begins"]
 
 
 def lines_of(summary):
