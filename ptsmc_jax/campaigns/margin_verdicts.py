@@ -123,10 +123,10 @@ def _verdicts(
             `NOT_DIFFERENTIABLE`.
     """
     results, trials = [], max(map(np.size, causes.values()))
+    known = {cause: int(np.sum(mask)) for cause, mask in causes.items()}
     for requirement in required:
         values = np.asarray(by_name[requirement.metric])
-        counts = {cause: int(np.sum(mask)) for cause, mask in causes.items()}
-        counts[NOT_DIFFERENTIABLE] = int(np.sum(np.isnan(values))) - sum(counts.values())
+        counts = {**known, NOT_DIFFERENTIABLE: int(np.sum(np.isnan(values))) - sum(known.values())}
         reason = " and ".join(
             cause if trials == 1 else f"{cause} in {count} trial{'s' if count > 1 else ''}"
             for cause, count in counts.items()

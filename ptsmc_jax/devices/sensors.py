@@ -73,12 +73,7 @@ class Sensor(ABC):
     def sample(self, memory: PyTree, x: PyTree, now: Ticks, dt: Scalar, star_x: PyTree = None) -> tuple[PyTree, PyTree]:
         """Return the readings before any filter, and the memory.
 
-        Args:
-            memory: from `begin`, or from the last sample.
-            x: true state.
-            now: the control period that the sample begins.
-            dt: length of the period that ends at the sample [s].
-            star_x: true state at the time of `newest_reading_age`, for sensors with their own clock; None without them.
+        Args: those of `measure`.
 
         Returns:
             The readings, a pytree like `x`, and the memory for the next sample.
@@ -90,12 +85,7 @@ class Sensor(ABC):
     ) -> tuple[dict[str, Array], PyTree]:
         """Return the sensor inputs of exported C at a sample, by name, and the memory.
 
-        Args:
-            memory: from `begin`, or from the last sample.
-            x: true state.
-            now: the control period that the sample begins.
-            dt: length of the period that ends at the sample [s].
-            star_x: true state at the time of `newest_reading_age`, for sensors with their own clock; None without them.
+        Args: those of `measure`.
 
         Returns:
             For a spacecraft "attitude" (4,) [-] and "rate" (3,) [rad/s], otherwise "x", the measured state. Then the
