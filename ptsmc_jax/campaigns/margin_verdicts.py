@@ -119,8 +119,8 @@ def _verdicts(
     Args:
         required: the required margins.
         by_name: the margins of one loop, (), or of many loops, (loops,), by name; NaN if a loop has no margin.
-        causes: which trials have no margin for a cause, bool, by cause. The other missing margins have the cause
-            `NOT_DIFFERENTIABLE`.
+        causes: for each cause, which trials have no margin because of it, bool. The other missing margins have the
+            cause `NOT_DIFFERENTIABLE`.
     """
     results, trials = [], max(map(np.size, causes.values()))
     known = {cause: int(np.sum(mask)) for cause, mask in causes.items()}

@@ -51,7 +51,7 @@ def result_table(front: Front) -> Table:
 
 
 def _describe_no_value(cost: str, point: Point) -> str:
-    """Return "none" for a margin without a limit, which the peak sensitivity of a closed loop shows, or "-"."""
+    """Return the text for a missing cost: "none" for an unlimited margin of a closed loop, and "-" otherwise."""
     return "none" if cost.endswith("margin") and math.isfinite(point.costs.get("peak_sensitivity", math.nan)) else "-"
 
 

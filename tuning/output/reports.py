@@ -191,7 +191,7 @@ def map_report(rows: Sequence[Sequence[str]], plant: str) -> Report:
 
 
 def map_lines(pairs: Sequence[Mapping[str, Any]], keys: tuple[str, str], plant: str) -> Iterator[str]:
-    """Return the best pair, of those that keep every requirement, and how many pairs fail, and why.
+    """Return lines on the best pair that keeps every requirement, on the number of pairs that fail, and on the reasons.
 
     Args:
         pairs: the rows of a map by column; x and y are the values of the keys.
