@@ -36,7 +36,7 @@ its own, such as `["350 kg cm^2", "300 kg cm^2", 0.03]`:
 
 EXAMPLES
 
-A unit consists of symbols with powers and square roots, separated by spaces or `/`:
+A unit consists of symbols with powers and square roots, separated by spaces or `/`, such as "kg m^2 s^-1":
 
 - symbols that may have a prefix: WITH_PREFIX;
 - other symbols: WITHOUT_PREFIX;

@@ -1,6 +1,7 @@
 """Numbers with a unit, such as "0.3 deg/h". Start with `to_number`.
 
-A unit consists of symbols with powers and square roots, separated by spaces or "/": "kg cm^2", "deg/s/sqrt(Hz)".
+A unit consists of symbols with powers and square roots, separated by spaces or "/":
+"kg cm^2", "deg/s/sqrt(Hz)", "rad s^-1".
 """
 
 import decimal
@@ -43,7 +44,9 @@ WITHOUT_PREFIX: dict[str, tuple[Decimal | int, Mapping[str, float]]] = {
     "ft": (Decimal("0.3048"), _M),
     "dB": (1, {"dB": 1.0}),
 }
-_SPELLINGS = str.maketrans({"°": "deg", "\u00b5": "u", "\u03bc": "u", "²": "^2", "·": " ", "*": " ", "-": " "})
+_SPELLINGS = str.maketrans(
+    {"°": "deg", "\u00b5": "u", "\u03bc": "u", "·": " ", "*": " ", "⁻": "-", "¹": "1", "²": "2", "³": "3"}
+)
 
 # usual numbers in usual units, by the unit of a key
 EXAMPLES = {
@@ -92,7 +95,8 @@ def parse(text: str) -> tuple[Decimal, dict[str, float]] | None:
     >>> parse("mN m")
     (Decimal('0.001'), {'kg': 1.0, 'm': 2.0, 's': -2.0})
     """
-    text = re.sub(r"√\(?(\w+)\)?", r"sqrt(\1)", text.translate(_SPELLINGS))
+    raised = re.sub("([⁻¹²³]+)", r"^\1", text).translate(_SPELLINGS)
+    text = re.sub(r"√\(?(\w+)\)?", r"sqrt(\1)", re.sub(r"(?<!\^)-", " ", raised))  # "N-m" is "N m"
     value, total = Decimal(1), dict[str, float]()
     for k, part in enumerate(text.split("/")):
         factors = part.split()
@@ -119,7 +123,7 @@ def in_si(unit: str) -> float:
 
 def _parse_factor(factor: str) -> tuple[Decimal, dict[str, float]] | None:
     """Return value and powers of a symbol with its prefix, its power or a square root."""
-    match = re.fullmatch(r"(sqrt\()?([A-Za-z]+)(?(1)\)|(?:\^(\d(?:\.5)?))?)", factor)
+    match = re.fullmatch(r"(sqrt\()?([A-Za-z]+)(?(1)\)|(?:\^(-?\d(?:\.5)?))?)", factor)
     if match is None:
         return None
     name, scale, exponent = match[2], Decimal(1), Decimal("0.5" if match[1] else match[3] or 1)

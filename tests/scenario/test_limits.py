@@ -87,6 +87,8 @@ def test_every_unit_of_a_key_has_an_example_for_error_messages():
         ("3 uN m/sqrt(s)", "N m/sqrt(s)", 3e-6),
         ("0.5 1/min", "1/s", 0.5 / 60),
         ("398600.44 km^3/s^2", "m^3/s^2", 3.9860044e14),
+        ("398600.44 km³ s⁻²", "m^3/s^2", 3.9860044e14),
+        ("2 deg s^-1", "rad/s", np.deg2rad(2.0)),
         ("20 us", "s", 2e-5),
         ("2 msec", "s", 2e-3),
     ],
@@ -100,6 +102,7 @@ def test_units_are_products_of_symbols_with_prefixes(text, unit, value):
     [
         ("1 kkg m^2", "kg m^2"), ("1 mmin", "s"), ("1 mh", "s"), ("1 s-1", "1/s"), ("1 Hz", "1/s"), ("1 1/s", "rad/s"),
         ("1 lb in", "N m"), ("1 arcsec/sqrt(Hz)", "rad"), ("1 sqrt(s", "s"), ("1 m/", "m"), ("1 x1", "x1"),
+        ("1 s^--1", "1/s"), ("1 s^", "s"), ("1 s-²", "1/s^2"),
     ],
 )  # fmt: skip
 def test_other_units_are_refused(text, unit):
