@@ -23,7 +23,8 @@ from ptsmc_jax.scenario.tables import Scenario
 
 HALF_WAVES = (1, 2, 3, 4, 6, 8)  # numbers of half waves of the sines in the manoeuvre
 CANDIDATES, REFINEMENTS = 24, 40  # random profiles, and changes of the best one
-DEFAULT_RATE = 0.05  # default limit of the rate [rad/s]
+# by default the manoeuvre lasts 5 t_f, and the largest rate is 3 rad / t_f, as in a slew of about 90 deg within t_f
+DURATION_IN_TIMES, RATE_TIMES_TIME = 5.0, 3.0
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,9 @@ class Design:
     """A proposed manoeuvre and the expected accuracy."""
 
     problem: Problem
+    duration: float  # [s]
+    rate: float  # limit of the rate about an axis [rad/s]
+    torque: float  # limit of the torque about an axis [N m]
     frame: pl.DataFrame  # t [s], sent1.. [N m] and the expected readings, with the columns of `trajectory.csv`
     std: np.ndarray  # expected 1 sigma of each number (k,)
     plain_std: np.ndarray  # expected 1 sigma (k,) after one slew about each axis in turn, within the same limits
@@ -47,9 +51,9 @@ class Design:
 
 def design(
     what: Scenario | str | Path,
-    duration: float = 300.0,
+    duration: float | None = None,
     *,
-    rate: float = DEFAULT_RATE,
+    rate: float | None = None,
     torque: float | None = None,
     report: Callable[[str], None] = lambda text: None,
 ) -> Design:
@@ -57,8 +61,8 @@ def design(
 
     Args:
         what: a scenario, or the path of its file. [identify] names the parameters, [hardware] the noises.
-        duration: duration of the manoeuvre [s].
-        rate: largest rate about an axis [rad/s]; for other plants, the largest velocity.
+        duration: duration of the manoeuvre [s]; by default 5 t_f.
+        rate: largest rate about an axis [rad/s]; for other plants, the largest velocity; by default 3 / t_f.
         torque: largest torque about an axis [N m]; by default the limit of the actuators.
         report: function that is called with a line of progress.
 
@@ -66,14 +70,17 @@ def design(
         ScenarioError: no limit of the torque is known, or the manoeuvre is shorter than 20 control periods.
     """
     loaded = reading.complete(reading.to_scenario(what))
-    period = loaded.loop.period
-    if not loaded.sampled or duration < 20.0 * period:
+    period, t_f = loaded.loop.period, float(loaded.controller.t_f)
+    length = DURATION_IN_TIMES * t_f if duration is None else duration
+    largest_rate = RATE_TIMES_TIME / t_f if rate is None else rate
+    if not loaded.sampled or length < 20.0 * period:
         raise ScenarioError("a design needs the sampled loop and a manoeuvre of at least 20 control periods")
-    t = period * np.arange(round(duration / period) + 1)
+    t = period * np.arange(round(length / period) + 1)
     shapes = np.stack([np.sin(np.pi * k * t / t[-1]) for k in HALF_WAVES])  # (waves, rows) for unit amplitudes
     log = _log_at_rest(loaded, t)
     problem = parameters.build(loaded, [log])
-    scale_momentum = _momentum_scaler(loaded, problem, rate, torque)
+    largest_torque = _smallest_torque_limit(loaded, torque)
+    scale_momentum = _momentum_scaler(loaded, problem, largest_rate, largest_torque)
     search = Search(problem, [], np.inf, lambda text: None)
 
     def information(momentum: np.ndarray) -> tuple[np.ndarray, Measurements]:
@@ -107,6 +114,9 @@ def design(
     best_information, expected = information(chosen)
     return Design(
         problem,
+        length,
+        largest_rate,
+        largest_torque,
         _to_frame(expected),
         number_std(best_information),
         number_std(information(plain_momentum)[0]),
@@ -114,13 +124,8 @@ def design(
     )
 
 
-def _momentum_scaler(
-    loaded: Scenario, problem: Problem, rate: float, torque: float | None
-) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function that scales a momentum profile (rows, m) [N m s] to 95 % of the tightest limit.
-
-    The limits are those of torque, rate and wheel momentum. Raises ScenarioError if no limit of the torque is known.
-    """
+def _smallest_torque_limit(loaded: Scenario, torque: float | None) -> float:
+    """Return the smallest of a limit and those of the actuators [N m]; raise ScenarioError if there is none."""
     wheels = loaded.reaction_wheels
     limits = [torque, loaded.devices.torque_limit, None if wheels is None else wheels.torque_limit]
     known = [limit for limit in limits if limit is not None]
@@ -128,15 +133,25 @@ def _momentum_scaler(
         raise ScenarioError(
             "hardware.torque_limit is absent, but a design needs the largest torque; allowed is --torque too"
         )
-    plant, actuators, largest_torque = problem.model.plant, problem.model.actuators, min(known)
+    return min(known)
+
+
+def _momentum_scaler(
+    loaded: Scenario, problem: Problem, rate: float, torque: float
+) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a function that scales a momentum profile (rows, m) [N m s] to 95 % of the tightest limit.
+
+    The limits are those of torque, rate and wheel momentum.
+    """
+    wheels, plant, actuators = loaded.reaction_wheels, problem.model.plant, problem.model.actuators
     allocation = np.eye(plant.inputs) if actuators.wheels is None else np.asarray(actuators.wheels.allocation)
     wheel_limit = np.inf if wheels is None or wheels.momentum_limit is None else wheels.momentum_limit
 
     def scale(momentum: np.ndarray) -> np.ndarray:
-        torque = np.diff(momentum, axis=0) / loaded.loop.period
+        command = np.diff(momentum, axis=0) / loaded.loop.period
         ratios = [
-            np.max(np.abs(torque)) / largest_torque,
-            np.max(np.abs(torque @ allocation.T)) / largest_torque,
+            np.max(np.abs(command)) / torque,
+            np.max(np.abs(command @ allocation.T)) / torque,
             np.max(np.abs(momentum @ np.asarray(plant.inertia_inverse).T)) / rate,
             np.max(np.abs(momentum @ allocation.T)) / wheel_limit,
         ]

@@ -116,10 +116,12 @@ def test_a_design_names_parameters_that_are_known_better_than_the_manoeuvre_can_
     known = SCENARIO.replace('prior = "none"', 'prior = "dispersion"')
     known += '[dispersion]\nactuator_scale = { kind = "relative_normal", std = 1e-6 }\n'
     (logged / "known.toml").write_text(known)
-    status, _, err = command("identify", "known.toml", "--design", "--duration", 6, "--rate", 0.5, "--out", "plan")
+    status, _, err = command("identify", "known.toml", "--design", "--out", "plan")
     assert (status, err) == (0, "")
-    (sentence,) = json.loads((logged / "plan" / "summary.json").read_text())["undetermined"]
+    summary = json.loads((logged / "plan" / "summary.json").read_text())
+    (sentence,) = summary["undetermined"]
     assert "actuator_scale" in sentence
+    assert [summary[name] for name in ("duration", "rate", "torque")] == [25.0, 0.6, 2.0]  # t_f is 5 s
 
 
 @pytest.mark.parametrize(

@@ -34,8 +34,8 @@ def identify(
     Args:
         validate: Log that is predicted only, to check the model; several times.
         design: Propose a torque profile that determines the parameters; without logs.
-        duration: Duration of the profile in s or with a unit; default: 300.
-        rate: Largest rate in the profile in rad/s or with a unit, such as "2 deg/s"; default: 0.05.
+        duration: Duration of the profile in s or with a unit; default: 5 t_f.
+        rate: Largest rate in the profile in rad/s or with a unit, such as "2 deg/s"; default: 3 rad / t_f.
         torque: Largest torque in N m or with a unit; default: of the actuators.
     """
     if design == bool(logs):
@@ -57,15 +57,15 @@ def identify(
     from tuning.studies import identifying
 
     if design:
-        settings = {"duration": duration or 300.0, "rate": rate or designing.DEFAULT_RATE, "torque": torque}
         with store.lock_folder(folder, force=common.force):
             with progress.Progress(common.quiet) as report:
-                profile = designing.design(loaded, **settings, report=lambda text: report(text, 0, 0))
+                profile = designing.design(
+                    loaded, duration, rate=rate, torque=torque, report=lambda text: report(text, 0, 0)
+                )
             write = identifying.write_design
-            store.write_folder(folder, lambda staging: write(staging, loaded, profile, common.figures, settings))
+            store.write_folder(folder, lambda staging: write(staging, loaded, profile, common.figures))
         if not common.quiet:
-            summary = identifying.design_summary(profile, settings)
-            terminal.print_result("identify", summary, loaded.plant.kind, folder)
+            terminal.print_result("identify", identifying.design_summary(profile), loaded.plant.kind, folder)
         return 0
     fitted, predicted = (
         [telemetry.measurements(loaded, telemetry.read(path), path.name) for path in paths]

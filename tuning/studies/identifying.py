@@ -41,15 +41,14 @@ def write(folder: Path, identification: Identification, figures: bool, made_by: 
         style.save(identification_plots.identification_figures(identification), folder / "figures")
 
 
-def design_summary(design: Design, settings: Mapping[str, object]) -> dict[str, object]:
-    """Return the content of `summary.json` of a design; settings: duration [s] and limits of the manoeuvre."""
+def design_summary(design: Design) -> dict[str, object]:
+    """Return the content of `summary.json` of a design."""
+    limits = {"duration": design.duration, "rate": design.rate, "torque": design.torque}
     rows = list(design.table().iter_rows(named=True))
-    return {"status": "designed", **settings, "parameters": rows, "undetermined": design.undetermined}
+    return {"status": "designed", **limits, "parameters": rows, "undetermined": design.undetermined}
 
 
-def write_design(
-    folder: Path, scenario: Scenario, design: Design, figures: bool, settings: Mapping[str, object]
-) -> None:
+def write_design(folder: Path, scenario: Scenario, design: Design, figures: bool) -> None:
     """Write a result folder: `profile.csv`, `summary.json` and a figure of the profile.
 
     Args:
@@ -57,10 +56,9 @@ def write_design(
         scenario: the scenario.
         design: the proposed manoeuvre.
         figures: write figures too.
-        settings: duration [s] and limits of the manoeuvre.
     """
     versions = {"command": "identify", "seed": None, "design": True, **custom.checksums(scenario)}
-    store.write_run_files(folder, parsing.dump(scenario), versions, design_summary(design, settings))
+    store.write_run_files(folder, parsing.dump(scenario), versions, design_summary(design))
     frame = design.frame
     store.write_csv(folder / "profile.csv", frame.columns, frame.rows())
     if figures:
