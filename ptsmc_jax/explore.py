@@ -328,7 +328,10 @@ def verdicts(what: Scenario | Study | str | Path, rows: pl.DataFrame, *, seed: i
         raise ValueError(f"the rows have no {missing[0]}" if missing else "there are no rows, but must be one at least")
     on_margins = list[Verdict]()
     if scenario.margin_requirements(loaded):
-        on_margins = margin_verdicts.judge_trials(_to_study(what), seed, None, campaign.has_finished(rows))
+        numbers = rows["trial"].to_numpy() if "trial" in rows.columns else np.arange(rows.height)
+        finished = np.ones(numbers.max() + 1, bool)
+        finished[numbers] = campaign.has_finished(rows)
+        on_margins = margin_verdicts.judge_trials(_to_study(what), seed, None, finished)
     return [*campaign.verdicts(required, rows), *on_margins]
 
 

@@ -240,6 +240,9 @@ def test_margin_constraints_agree_with_verdicts_and_finite_differences(drawn):
     rows = pl.DataFrame({"trial": [0, 1], "status": ["ok", "ok"], "peak_torque": [1.0, 2.0]})  # not used by margins
     told = explore.verdicts(posed.ready.scenario, rows, seed=3)[-2:]
     assert [v.worst for v in told] == [v.worst for v in verdicts]  # loops of the same trials
+    other_order = rows.with_columns(trial=pl.Series([TRIALS, 0]), status=pl.Series(["nonfinite", "ok"]))
+    later_failed = explore.verdicts(posed.ready.scenario, other_order, seed=3)[-2:]
+    assert [v.worst for v in later_failed] == [v.worst for v in verdicts]  # later trials do not matter
     tight = dataclasses.replace(asked, limits=asked.limits * 0.9)
     np.testing.assert_allclose(sloped(tight, bounds, normalised)["c"] + 1, (found["c"] + 1) / 0.9, rtol=1e-12)
 
