@@ -14,11 +14,12 @@ NOW = vector(0.0)
 
 
 def observer(inertia=FULL_INERTIA, gain=(10.0, 4.0, 25.0), c=1e-3, start=0.0):
+    """Return a nonlinear observer of a rigid body; c: bound on the rate of d, start: initial estimation error."""
     return nonlinear.NonlinearObserver(rigid_body.spacecraft(inertia), jnp.asarray(gain), vector(c), vector(start))
 
 
 @pytest.mark.parametrize("dt", [0.0, 1e-9, 0.05, 1.0, 1e3])
-def test_update_matrix_equals_its_closed_form(dt):
+def test_update_matrix_of_the_digital_observer_equals_its_closed_form(dt):
     found = observer()
     a = np.diag([10.0, 4.0, 25.0]) @ np.linalg.inv(FULL_INERTIA)
     expected = a if dt == 0.0 else (np.eye(3) - expm(-a * dt)) / dt
@@ -27,6 +28,7 @@ def test_update_matrix_equals_its_closed_form(dt):
 
 
 def body_state(w):
+    """Return a state at the identity attitude with the body rate w [rad/s]."""
     return rigid_body.AttitudeState(vector(0.0, 0.0, 0.0, 1.0), vector(w))
 
 
@@ -63,7 +65,7 @@ def test_digital_estimate_of_a_constant_disturbance_is_unbiased(gain):
 
 @pytest.mark.parametrize("inertia", [PAPER_INERTIA, FULL_INERTIA, (1e-3, 1.2e-3, 1.5e-3)])
 @pytest.mark.parametrize("dt", [1e-3, 0.05, 10.0])
-def test_digital_update_is_stable_for_any_gain_and_period(inertia, dt):
+def test_digital_observer_is_stable_for_any_gain_and_period(inertia, dt):
     for gain in (0.5, 10.0, 300.0):
         found = observer(inertia, (gain,) * 3)
         matrix = np.asarray(found.update_matrix(vector(dt)))
@@ -71,7 +73,7 @@ def test_digital_update_is_stable_for_any_gain_and_period(inertia, dt):
         assert np.all((modes >= -1e-12) & (modes < 1.0))
 
 
-def test_continuous_estimation_error_obeys_54():
+def test_continuous_estimation_error_obeys_equation_54():
     """For the motion of the plant, d_hat' = forcing - A d_hat equals -A (d_hat - d)."""
     found = observer()
     w, u, d, d_hat = (vector(np.random.default_rng(k).normal(size=3)) for k in range(4))
@@ -85,7 +87,7 @@ def test_continuous_estimation_error_obeys_54():
     np.testing.assert_allclose(found_rate, -a @ np.asarray(d_hat - d), atol=1e-12)
 
 
-def test_error_bound_equals_the_corrected_form_of_55():
+def test_bound_on_the_estimation_error_equals_the_corrected_equation_55():
     bound = observer(PAPER_INERTIA, (10.0,) * 3).error_bound()
     rate = 10.0 / 14.0
     for t in (0.0, 0.7, 5.0, 100.0):
@@ -131,7 +133,7 @@ def test_bound_for_unequal_gains_has_the_factor_root_of_their_condition_number()
     assert error < float(bound(vector(100.0)))
 
 
-def test_derivative_of_the_bound_is_finite_for_equal_moments_of_inertia():
+def test_derivative_of_the_error_bound_by_the_gain_is_finite_for_equal_moments_of_inertia():
     def bound_for_long_times(gain):
         return observer((5.0, 5.0, 5.0), jnp.full(3, gain)).error_bound().floor
 

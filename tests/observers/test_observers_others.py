@@ -22,11 +22,13 @@ GAIN, T_O, DELTA_O, MU = 0.7, 4.0, 0.2, 2.5
 
 
 def prescribed_time_observer(model: base.Plant = MASS, gain=GAIN, c=0.0, start=0.0, mu=MU, t_o=T_O, delta_o=DELTA_O):
+    """Return a prescribed-time observer of a plant with the same gain for every input."""
     values = (vector([gain] * model.inputs), *map(vector, (c, start, mu)))
     return prescribed_time.PrescribedTimeObserver(model, *values, t_o=vector(t_o), delta_o=vector(delta_o))
 
 
 def finite_time_observer(model: base.Plant = MASS, gain=1.0, c=0.0, start=0.0, width=0.0):
+    """Return a finite-time observer of a plant with the same gain for every input; width: boundary layer."""
     return finite_time.FiniteTimeObserver(model, vector([gain] * model.inputs), vector(c), vector(start), vector(width))
 
 
@@ -230,6 +232,8 @@ def test_every_observer_is_within_its_bound_on_every_plant(plant, mode, kind):
 
 
 def _pendulums():
+    """Return a custom system of two coupled pendulums, whose input gains depend on their angles."""
+
     def G(t, x_1, x_2):  # noqa: N802
         return jnp.diag(1.0 / (1.0 + 0.2 * jnp.cos(x_1)))
 
@@ -246,6 +250,7 @@ PENDULUMS = _pendulums()
 
 
 def test_gradients_by_observer_gain_are_finite_and_not_zero_without_a_rate_bound():
+    """The window error of a run is differentiated by the gain of a prescribed-time and of a finite-time observer."""
     wave = disturbances.Sinusoid(*(vector([v]) for v in (0.01, 0.1, 0.0, 0.0)))
     run = chain_parts([1.0, 0.0], 6.0, 3.0, 0.3, period=0.25, disturbance=wave)
     for found in (prescribed_time_observer(run.plant, gain=10.0), finite_time_observer(run.plant, gain=0.1)):

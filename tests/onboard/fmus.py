@@ -19,7 +19,7 @@ class Unit:
         self.unit = self.instance()
 
     def instance(self):
-        """A new instance."""
+        """Return a new instance of the FMU."""
         made = (FMU3Slave if self.three else FMU2Slave)(
             guid=self.described.guid, unzipDirectory=self.place, instanceName="unit",
             modelIdentifier=self.described.coSimulation.modelIdentifier,
@@ -28,7 +28,7 @@ class Unit:
         return made
 
     def _of_type(self, names, prefix, unit):
-        """Groups of names by their type, with the function that reads or writes it."""
+        """Return the names grouped by type, each group with the function of `unit` that reads or writes it."""
         groups = {}
         for name in names:
             groups.setdefault(self.of[name].type, []).append(name)
@@ -63,7 +63,7 @@ class Unit:
         (unit or self.unit).doStep(currentCommunicationPoint=k * self.period, communicationStepSize=self.period)
 
     def names(self, causality):
-        """Names of the variables of this causality."""
+        """Return the names of all variables with this causality, such as "input"."""
         return [v.name for v in self.described.modelVariables if v.causality == causality]
 
 

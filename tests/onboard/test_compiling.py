@@ -18,7 +18,7 @@ from tests.onboard.flights import FLIGHTS
 
 @pytest.fixture(scope="module")
 def chain(tmp_path_factory):
-    """The folder of a small controller."""
+    """Export the controller of a chain and return its folder."""
     place = tmp_path_factory.mktemp("exported") / "controller"
     program(FLIGHTS["chain"], place)
     return place
@@ -47,7 +47,7 @@ def test_a_controller_that_is_absent_or_does_not_fit_or_compile_raises_an_error(
 
 @needs_compiler
 def test_compiled_files_are_those_that_a_campaign_copies_and_checks(chain, tmp_path):
-    """A header in another folder would not be part of the campaign's copy and checksum."""
+    """Headers in the controller's folder are copied and part of the checksum. A header in another folder is refused."""
     changed = shutil.copytree(chain, tmp_path / "changed")
     code = changed / "ptsmc_flight.c"
     code.write_text('#include "board.h"\n' + code.read_text())
@@ -95,7 +95,7 @@ def test_a_folder_with_the_layout_of_another_controller_raises_an_error(chain, t
 
 @needs_compiler
 def test_cc_may_have_options_and_must_compile_for_this_machine(chain, monkeypatch, tmp_path):
-    """Warnings of -pedantic in XLA's headers must not stop the compilation."""
+    """CC is the compiler command. Warnings of -pedantic in XLA's headers must not stop the compilation."""
     monkeypatch.chdir(tmp_path)
     shutil.copytree(chain, "-c")
     monkeypatch.setenv("CC", f"{CC} -pedantic -Wall -Wextra -Werror")
@@ -107,7 +107,7 @@ def test_cc_may_have_options_and_must_compile_for_this_machine(chain, monkeypatc
 
 
 @needs_compiler
-def test_a_period_read_with_32_bits_is_the_same(chain):
+def test_a_period_rounded_to_32_bits_agrees_with_the_period_of_the_controller(chain):
     """The comparison of periods allows for the rounding of 32 bits."""
     library = Library(chain)
     with jax.enable_x64(False):
@@ -117,7 +117,7 @@ def test_a_period_read_with_32_bits_is_the_same(chain):
 
 
 def compiled(compiler, *arguments):
-    """The finished process of a compiler."""
+    """Run a C compiler with these arguments and strict warnings, and return the finished process."""
     return subprocess.run([compiler, *STRICT, *map(str, arguments)], capture_output=True, text=True, check=False)
 
 
@@ -178,5 +178,6 @@ def test_files_of_different_precision_do_not_link(chain, tmp_path, compiler, rea
 @needs_compiler
 @pytest.mark.parametrize("name", ["in", "init", "state", "parameters"])
 def test_a_controller_may_have_the_name_of_one_of_its_symbols(tmp_path, name):
+    """A controller with a name such as `init`, which its C code also uses for a function or a variable, compiles."""
     folder.export(scenario.from_tables(FLIGHTS["chain"]), tmp_path / "out", name=name, trials=1)
     assert Library(tmp_path / "out").name == name

@@ -71,7 +71,10 @@ FLOWN = {
 
 
 def off(known, library):
-    """Largest difference of the commands of C and of the library, relative to the largest command, in two trials."""
+    """Return the largest difference between commands of the compiled C and of the simulation in two trials.
+
+    The difference is relative to the largest command.
+    """
     ready = scenario.study(folder.on_flight_clock(known))
     computer, trials = build_board(ready.parts), jnp.arange(2, dtype=jnp.uint32)
     parts = replace(ready.parts, substeps=10)  # equal for all gains, to share one compiled program
@@ -100,12 +103,12 @@ def put(library, name, value):
 
 
 def exported(tables, place):
-    """A complete scenario, whose defaults do not follow later changes, and its compiled controller."""
+    """Export a scenario; return it with its defaults as stated values, and its compiled controller."""
     return scenario.reading.freeze_defaults(program(tables, place).scenario), Library(place)
 
 
 def changed(known, changes):
-    """The scenario with these changes."""
+    """Return the scenario with other values of keys; changes: {key: (parameter in C, value)}."""
     plain = {key: np.asarray(value).T.tolist() if key == "wheels__axes" else np.asarray(value).tolist()
              for key, (_, value) in changes.items()}  # fmt: skip
     return scenario.replace(known, **plain)
@@ -113,7 +116,7 @@ def changed(known, changes):
 
 @needs_compiler
 @pytest.mark.parametrize("name", short(list(FLOWN), ["wheels"]))
-def test_changed_parameters_give_the_commands_of_the_library(name, tmp_path):
+def test_changed_parameters_in_c_give_the_commands_of_the_changed_scenario(name, tmp_path):
     """Rounding is 1e-16 of the largest command, or 1e-14 with a filter. The documented accuracy is 1e-12."""
     tables, changes = FLOWN[name]
     known, library = exported(tables, tmp_path / "controller")
@@ -157,7 +160,8 @@ int main(void)
 
 
 @needs_compiler
-def test_parameters_may_change_between_samples(tmp_path):
+def test_parameters_in_c_may_change_between_samples(tmp_path):
+    """The next output depends on the new parameters and the state only, as if these parameters had always been set."""
     tables, _ = FLOWN["raw"]
     known, library = exported(tables, tmp_path)
     half, rows = 0.25, np.zeros((2, len(library.columns["in"])))
@@ -175,6 +179,7 @@ class Steepest(LowPass):
     """An observer whose K2 needs an operation without a counterpart in C."""
 
     def error_bound(self):
+        """Return K2 from the largest moment of inertia, an eigenvalue, which C cannot compute."""
         return ErrorBound(*[self.disturbance_bound * jnp.linalg.eigvalsh(self.model.inertia)[-1]] * 3)
 
 

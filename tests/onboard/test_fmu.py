@@ -51,6 +51,7 @@ RICH = flight(
 
 
 def made_from(tables, reference_input=False):
+    """Return the controller of a scenario for the export; reference_input: the reference is an input of it."""
     complete = scenario.reading.complete(scenario.from_tables(tables))
     return folder.Controller(complete, "flight", "a scenario", reference_input)
 
@@ -79,6 +80,7 @@ def true_states(made, rows):
 
 @pytest.fixture(scope="module")
 def rich():
+    """Return the controller of a scenario with wheels, delay, filter, noise, dispersions and a wheel failure."""
     return made_from(RICH)
 
 
@@ -93,13 +95,13 @@ def files(rich, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def expected(rich):
-    """Trials 0 and 3 as the simulator computes them."""
+    """Return the true states of trials 0 and 3, computed by the simulator."""
     return simulated(rich, SEED, [0, 3])
 
 
 @pytest.fixture(scope="module")
 def library(tmp_path_factory):
-    """The exported C, compiled."""
+    """Return the compiled C code of the controller, exported without an FMU."""
     place = tmp_path_factory.mktemp("exported") / "c"
     program(RICH, place)
     return Library(place)
@@ -107,17 +109,18 @@ def library(tmp_path_factory):
 
 @pytest.fixture(scope="module", params=fmu_files.VERSIONS)
 def loop(files, request):
-    """Controller and plant of one version of FMI."""
+    """Load the FMUs of controller and plant of one version of FMI."""
     return tuple(Unit(files / f"{name}_fmi{request.param}.fmu") for name in ("controller", "plant"))
 
 
 def run(loop, trial=0, count=SAMPLES):
+    """Reset both FMUs and simulate a trial; return the rows of `closed_loop`."""
     for one in loop:
         one.unit.reset()
     return closed_loop(loop, count, {"seed": SEED, "trial": trial})
 
 
-def test_fmpy_finds_no_problem(files):
+def test_fmpy_finds_no_problem_in_the_fmus(files):
     found = {path.name: validate_fmu(str(path)) for path in sorted(files.iterdir())}
     assert found == {f"{name}_fmi{k}.fmu": [] for name in ("controller", "plant") for k in (2, 3)}
 
@@ -147,7 +150,7 @@ def assert_outputs_of_the_c(library, controller, rows):
         assert status == commands["status"]
 
 
-def test_controller_has_the_outputs_of_the_exported_c(library, loop):
+def test_controller_fmu_has_the_outputs_of_the_exported_c(library, loop):
     assert_outputs_of_the_c(library, loop[0], run(loop, 3))
 
 
@@ -182,7 +185,7 @@ def test_saved_and_restored_states_replay_to_the_last_bit(loop):
     assert proceed(first) == rows[20:]
 
 
-def test_two_instances_are_independent(loop):
+def test_two_instances_of_an_fmu_are_independent(loop):
     """Second instances of both FMUs, for another trial, do not change the results of the first ones."""
     controller, plant = loop
     alone = run(loop, 2, 10)
@@ -231,7 +234,7 @@ def test_shorter_communication_steps_give_the_same_samples(loop):
         readings = plant.read(plant.names("output"))
 
 
-def test_gains_are_tunable_and_the_period_is_fixed(loop):
+def test_gains_of_the_controller_fmu_are_tunable_and_its_period_is_fixed(loop):
     controller, _ = loop
     usual = run(loop, 1, 12)
     for one in loop:
@@ -251,7 +254,7 @@ def test_gains_are_tunable_and_the_period_is_fixed(loop):
         controller.unit.doStep(0.0, controller.period)  # earlier than the last step's end
 
 
-def test_inertia_of_the_plant_can_be_changed_before_a_run(tmp_path):
+def test_inertia_of_the_plant_fmu_can_be_changed_before_a_run(tmp_path):
     """The inverse follows. The body turns as in closed form under a constant torque about a principal axis."""
     tables = flight(hardware={"attitude_noise": 0.0, "rate_noise": 0.0}, dispersion={},
                     disturbance={"kind": "constant", "amplitude": [0.0, 0.0, 0.0]})  # fmt: skip
@@ -266,7 +269,7 @@ def test_inertia_of_the_plant_can_be_changed_before_a_run(tmp_path):
     assert plant.read(["true_rate[3]"])["true_rate[3]"] == pytest.approx(0.5 / 20.0 * 10 * plant.period, rel=1e-12)
 
 
-def test_unusable_inputs_return_a_warning_and_the_last_command(loop):
+def test_unusable_inputs_of_the_controller_fmu_return_a_warning_and_the_last_command(loop):
     controller, _ = loop
     rows = run(loop, 1, 5)
     controller.write({name: rows[-1][0][name] for name in controller.names("input")} | {"rate[1]": np.nan})
@@ -277,7 +280,7 @@ def test_unusable_inputs_return_a_warning_and_the_last_command(loop):
 
 @pytest.mark.parametrize("version", fmu_files.VERSIONS)
 @pytest.mark.parametrize("model", [pytest.param("controller", marks=pytest.mark.long), "plant"])
-def test_sanitizers_find_nothing(rich, tmp_path, model, version):
+def test_sanitizers_find_no_error_in_the_c_code_of_the_fmus(rich, tmp_path, model, version):
     made = {"controller": folder.controller_model, "plant": folder.plant_model}[model](rich)
     texts, token = fmu_files.source_texts(made, version)
     for name, text in texts.items():
@@ -295,7 +298,8 @@ def test_sanitizers_find_nothing(rich, tmp_path, model, version):
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_without_a_compiler_only_sources_are_written(tmp_path, monkeypatch):
+def test_fmus_contain_only_sources_without_a_compiler(tmp_path, monkeypatch):
+    """This needs the option `binary=False`; otherwise an export without a compiler raises an error."""
     monkeypatch.setenv("CC", "no-compiler")
     tables = scenario.reading.complete(scenario.from_tables(FLIGHTS["chain"]))
     with pytest.raises(ScenarioError, match="there is no C compiler no-compiler"):
@@ -332,14 +336,14 @@ def test_plant_that_c_cannot_express_is_refused():
         folder.plant_model(made)
 
 
-def test_names_of_scenario_files_may_contain_quotes(rich):
+def test_quotes_in_the_name_of_a_scenario_file_are_escaped_in_the_description_of_an_fmu(rich):
     model = folder.controller_model(rich)._replace(title='controller of "a" & b.toml')
     for version in fmu_files.VERSIONS:
         described = ElementTree.fromstring(fmu_files.model_description(model, version, "token", []).encode())
         assert described.attrib["modelName"] == model.title
 
 
-def test_units_are_products_of_base_units():
+def test_units_in_the_description_of_an_fmu_are_products_of_base_units():
     assert fmu_files.parse_unit("N m s") == ("N.m.s", {"kg": 1, "m": 2, "s": -1})
     assert fmu_files.parse_unit("rad/s^2") == ("rad/s2", {"rad": 1, "s": -2})
     assert fmu_files.parse_unit("1/s") == ("1/s", {"s": -1})

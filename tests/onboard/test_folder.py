@@ -78,7 +78,7 @@ EVERY = [(plant, kind) for plant, laws in LAWS.items() for kind in laws if kind 
 
 
 def of_law(plant, kind):
-    """A short scenario with this law and its default gains."""
+    """Return the tables of a short scenario with this law and its default gains."""
     gains = {"delta": 0.5} if kind == "prescribed_time" else {}
     tables = {"spacecraft": FLIGHTS["raw"], "chain": FLIGHTS["chain"], "system": FLIGHTS["system"]}[plant]
     return {**tables, "controller": {"kind": kind, "t_f": 5.0, **gains}}
@@ -123,7 +123,7 @@ class Named(ptsmc.AccelerationLaw):
 
 
 def with_custom_law(law):
-    """A short scenario with a custom law and a moving reference."""
+    """Return a short scenario with a custom law and a moving reference."""
     moving = {"kind": "spin", "rate": [0.01, 0.02, -0.01]}
     simulated = {**FLIGHTS["raw"], "reference": moving, "controller": {"kind": "custom", "code": law, "t_f": 5.0}}
     return scenario.reading.complete(scenario.from_tables(simulated))
@@ -150,7 +150,7 @@ class Tabled(ptsmc.AccelerationLaw):
     """PD with a loop that reads a table and fills another table."""
 
     def acceleration(self, now: Any, error: Any, error_rate: Any, bound: Any) -> Any:
-        """With 600 and 900 numbers."""
+        """Return a PD command from a loop over tables of 600 and 900 numbers, and the error as s."""
         shares = jnp.linspace(0.0, 1e-3, 300), jnp.linspace(1e-3, 0.0, 300)
         end, rows = jax.lax.scan(lambda c, row: (0.99 * c + row[0] * error, c * row[1]), jnp.zeros(3), shares)
         return -error - 2.0 * error_rate + 1e-3 * (end + rows[7] + rows[299]), error
@@ -184,11 +184,11 @@ class Unsigned(Odd):
     """A law with numbers of a type that C does not have here."""
 
     def begin(self) -> Any:
-        """The memory [-]."""
+        """Return the initial memory, an unsigned integer of 64 bits [-]."""
         return jnp.zeros(1, jnp.uint64)
 
     def acceleration(self, now: Any, error: Any, error_rate: Any, bound: Any) -> Any:
-        """PD, which counts."""
+        """Return a PD command, the error as s, and the memory plus one."""
         return -error - 2.0 * error_rate, error, now.memory + jnp.uint64(1)
 
 
@@ -196,7 +196,7 @@ class Lost(ptsmc.AccelerationLaw):
     """A law whose command becomes NaN."""
 
     def acceleration(self, now: Any, error: Any, error_rate: Any, bound: Any) -> Any:
-        """NaN behind 2 s."""
+        """Return a PD command, which is NaN after 2 s, and the error as s."""
         return jnp.where(now.t > 2.0, jnp.nan, -error - 2.0 * error_rate), error
 
 
@@ -215,7 +215,7 @@ def test_export_raises_an_error_for_unsupported_or_diverging_laws(tmp_path, law,
 
 
 @needs_make
-def test_check_starts_each_sample_from_the_simulated_state(exported, tmp_path):
+def test_make_check_starts_each_sample_from_the_simulated_state(exported, tmp_path):
     """Rounding errors thus do not accumulate. With a state of another time the next sample is invalid input."""
     place = shutil.copytree(exported, tmp_path / "controller")
     with (place / "vectors.csv").open() as file:
@@ -267,7 +267,7 @@ def test_random_input_passes_a_short_fuzz_run(exported, tmp_path):
     assert done.stdout.splitlines()[-1].startswith("10000 rounds:")
 
 
-def test_vectors_equal_the_simulated_run(exported):
+def test_exported_test_vectors_equal_the_simulated_run(exported):
     """Commands, estimates and s in vectors.csv equal the history of the same trial."""
     with (exported / "vectors.csv").open() as file:
         header, *rows = csv.reader(file)
@@ -295,7 +295,7 @@ def test_rounding_tolerance_uses_the_gain_growth_until_the_last_sample_before_th
     np.testing.assert_allclose(float(told), expected, rtol=0.05)  # sampled every 0.02 t_f
 
 
-def test_other_gains_change_the_parameters_and_not_the_code(exported, tmp_path):
+def test_other_gains_change_only_the_parameter_file_of_the_exported_c(exported, tmp_path):
     known = scenario.replace(
         scenario.read(exported / "scenario.toml"), controller__eta=2.8, spacecraft__inertia=[9, 11, 13]
     )

@@ -90,7 +90,7 @@ def given(made):
 
 
 def simulated(library, samples):
-    """Statuses and outputs of a sequence of samples."""
+    """Return statuses and outputs of a compiled controller for a sequence of samples, from its initial state."""
     return replayed(library, samples, library.initial_state())[:2]
 
 
@@ -332,7 +332,7 @@ def test_a_controller_with_other_parts_and_the_same_inputs_raises_an_error(expor
 
 @needs_compiler
 def test_differences_of_small_parameters_are_reported(exported):
-    """The comparison is relative, because parameters of small satellites may be below 1e-8 in their unit."""
+    """Parameters of C and of the scenario are compared relative to their size, which may be below 1e-8."""
     made, library = exported("chain")
     parts = replace(made.ready.parts, controller=replace(made.ready.parts.controller, sign_width=2e-9))
     at = library.columns["params"].index("law_sign_width")
@@ -343,7 +343,7 @@ def test_differences_of_small_parameters_are_reported(exported):
 
 
 @needs_compiler
-def test_rows_of_other_types_are_converted_and_of_wrong_length_raise_an_error(filtered):
+def test_arrays_of_other_types_are_converted_for_c_and_of_wrong_length_raise_an_error(filtered):
     """Otherwise C would read other numbers or write beyond the arrays."""
     library, samples = filtered
     state, given, told = library.initial_state(), samples[0], np.full(library.parameters.size, np.nan)
@@ -431,7 +431,7 @@ def test_a_draw_that_changes_one_of_several_shared_parameters_raises_an_error(wh
 
 @needs_compiler
 @pytest.mark.parametrize("name", short(["wheels", "implicit chain"], ["implicit chain"]))
-def test_single_precision_gives_the_same_metrics(exported, name):
+def test_a_controller_compiled_in_single_precision_gives_the_same_metrics(exported, name):
     """The metrics of one run agree to 1e-3. See `benchmarks/exported_c.py` for statistics of many trials."""
     made, library = exported(name, "float")
     single = InTheLoop(library, made.ready.parts).software

@@ -58,10 +58,11 @@ def suite(tmp_path_factory):
 
 
 def columns(library, name):
+    """Return the places of a quantity in the inputs of the compiled controller, one for each component."""
     return [k for k, column in enumerate(library.columns["in"]) if column.partition("[")[0] == name]
 
 
-def test_comments_name_the_table_of_each_sensor(suite):
+def test_comments_in_the_exported_c_name_the_table_of_each_sensor(suite):
     library, *_ = suite
     header = (library.folder / f"ptsmc_{library.name}.h").read_text()
     for place, name in enumerate(("star_tracker_1", "star_tracker_2", "vector_sensor_1", "custom_1")):

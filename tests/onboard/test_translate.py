@@ -19,10 +19,13 @@ MATRIX = np.array([[2.0, 0.3, -0.1], [0.3, 1.5, 0.2], [0.0, 0.2, 1.1]])
 
 
 def counted(x):
+    """Return the result of a loop with 30 passes."""
     return jax.lax.fori_loop(0, 30, lambda k, y: 0.9 * y + jnp.sin(x) / (k + 1.0), x)
 
 
 def gone_through(x):
+    """Return the last carry and all outputs of a scan over the rows of two tables."""
+
     def step(total, row):
         return total + row[0] * x, total * row[1]
 
@@ -30,27 +33,33 @@ def gone_through(x):
 
 
 def backwards(x):
+    """Return the last carry and all outputs of a scan from the last row of a table to the first."""
     return jax.lax.scan(lambda c, row: (c * 0.5 + row, c), x, jnp.linspace(0.0, 1.0, 20), reverse=True)
 
 
 def until(x):
+    """Return x scaled by a while loop until |x|^2 is at most 1e-3."""
     return jax.lax.while_loop(lambda y: jnp.sum(y * y) > 1e-3, lambda y: 0.7 * y, x)
 
 
 def branched(x):
+    """Return the result of one of two branches, chosen by the sign of x[0]."""
     return jax.lax.cond(x[0] > 0.0, lambda: (jnp.cos(x), x[1]), lambda: (jnp.sin(x), x[2]))
 
 
 def switched(x):
+    """Return the result of one of four branches, chosen by an index from x[0]."""
     return jax.lax.switch(jnp.int32(3.0 * x[0] + 1.5), [lambda: x, lambda: 2.0 * x, lambda: x**2, lambda: x[::-1]])
 
 
 def tabled(x):
+    """Return the value of a table, interpolated at x[0]."""
     return jnp.interp(x[0], jnp.linspace(-1.0, 1.0, 5), jnp.asarray([1.0, 3.0, 2.0, -1.0, 0.5]))
 
 
 @jax.custom_jvp
 def log(x):
+    """Return log(x + 1) by a custom function that has the same name as a function of C."""
     return jnp.log(x + 1.0)
 
 
@@ -151,17 +160,18 @@ def test_inverse_of_erf_is_accurate_next_to_its_poles(tmp_path):
 
 
 def text(function, *args):
+    """Return the C statements of a function of arrays as text."""
     return "\n".join(body(function, *map(jnp.asarray, args))[0])
 
 
-def test_equal_expressions_are_shared_and_constants_are_folded():
+def test_c_code_shares_equal_expressions_and_has_folded_constants():
     code = text(lambda x: (x[0] * x[1] + jnp.sin(x[1] * x[0]), 0.0 * x[2] + 1.0 * x[0], jnp.sqrt(4.0) * x[0]), X)
     assert code.count(" * ") == 2  # x0 x1 once, and 2 x0
     assert "R(2) * in[0]" in code
     assert "in[2]" not in code
 
 
-def test_variables_have_the_names_of_the_source():
+def test_variables_in_c_have_the_names_of_the_python_source():
     def law(x):
         wanted = -2.0 * x
         speed = jnp.sum(wanted * wanted)
@@ -173,7 +183,7 @@ def test_variables_have_the_names_of_the_source():
 
 
 @needs_compiler
-def test_names_of_the_source_do_not_hide_c_functions(tmp_path):
+def test_names_of_the_python_source_do_not_hide_c_functions(tmp_path):
     """A law may contain an assignment such as `tanh = jnp.tanh(s)`."""
 
     def law(x):
@@ -187,7 +197,7 @@ def test_names_of_the_source_do_not_hide_c_functions(tmp_path):
     np.testing.assert_allclose(found, expected, rtol=4e-15)
 
 
-def test_branches_and_loops_are_branches_and_loops_in_c():
+def test_branches_and_loops_in_jax_are_branches_and_loops_in_c():
     assert "if (in[0] > R(0)) {" in text(branched, X)
     assert "for (int k" in text(counted, X)
     assert "for (" not in text(lambda x: jax.lax.fori_loop(0, 3, lambda k, y: 0.5 * y + x, x), X)
@@ -258,6 +268,7 @@ def test_constants_of_unsupported_types_raise_an_error(known):
 @needs_compiler
 @pytest.mark.parametrize("index", [-3, 0, 4, 6, 11])
 def test_an_entry_at_a_computed_index_is_read_from_the_table_itself(tmp_path, index):
+    """The C code indexes the array; it does not choose among all entries. The index is clipped as in JAX."""
     table, at = np.linspace(1.0, 4.0, 7), np.array(float(index))
 
     def entry(table, at):
