@@ -20,7 +20,7 @@ VOID = {"meta", "link", "img"}
 
 
 class Page(HTMLParser):
-    """A page taken apart."""
+    """Parser of a page that fails at unknown elements, event handlers and links to other files."""
 
     def __init__(self, text):
         super().__init__()
@@ -29,6 +29,7 @@ class Page(HTMLParser):
         assert self.open == []
 
     def handle_starttag(self, tag, attrs):
+        """Check an element and its attributes, and record them."""
         assert tag in ELEMENTS, tag
         for name, value in attrs:
             assert not name.startswith("on"), (tag, name)
@@ -40,19 +41,22 @@ class Page(HTMLParser):
             self.open.append(tag)
 
     def handle_startendtag(self, tag, attrs):
+        """Check and record an element that ends at once."""
         self.handle_starttag(tag, attrs)
         if tag not in VOID:
             self.open.pop()
 
     def handle_endtag(self, tag):
+        """Check that the innermost open element ends."""
         assert self.open.pop() == tag
 
     def handle_data(self, data):
+        """Record text, separately inside and outside of scripts."""
         (self.scripts if self.open and self.open[-1] == "script" else self.texts).append(data)
 
     @property
     def text(self):
-        """What is read on it."""
+        """The text that a reader of the page sees."""
         return " ".join(" ".join(self.texts).split())
 
     @property
@@ -62,7 +66,7 @@ class Page(HTMLParser):
 
 
 def checked(folder):
-    """The page of a result folder, after what must hold for every one."""
+    """Build the page of a result folder, check everything that holds for every page, and return the parsed page."""
     made = page.build(folder)
     read = Page(made)
     (policy,) = [attrs["content"] for tag, attrs in read.found if attrs.get("http-equiv") == "Content-Security-Policy"]
@@ -86,4 +90,5 @@ def checked(folder):
 
 
 def read_versions(folder):
+    """Return the content of versions.json, the record of the command of a result folder."""
     return json.loads((folder / "versions.json").read_text())

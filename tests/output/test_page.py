@@ -24,7 +24,7 @@ HOSTILE = "<img src=x onerror=document.title=1>\"'&</script><script>alert(1)</sc
 
 
 def in_chromium(path, tmp_path, *options):
-    """A page rendered by Chromium, and its console messages."""
+    """Return a page rendered by Chromium, and the messages of its console."""
     assert CHROMIUM is not None
     with tempfile.TemporaryDirectory() as home:
         done = subprocess.run(
@@ -40,6 +40,7 @@ def in_chromium(path, tmp_path, *options):
 
 @pytest.fixture(scope="module")
 def kept(tmp_path_factory):
+    """Return the path of the results that `simulated` computes for its first test and copies for every test."""
     return tmp_path_factory.mktemp("kept") / "run"
 
 
@@ -51,7 +52,8 @@ def simulated(command, kept, tmp_path):
     return shutil.copytree(kept, tmp_path / "run")
 
 
-def test_a_run_becomes_a_page(command, simulated):
+def test_report_page_has_the_numbers_and_charts_of_the_run(command, simulated):
+    """The page shows metrics with units, dispersions, command, scenario and history. No other file changes."""
     before = tree(simulated)
     code, said, error = command("report", "run")
     assert (code, said.strip(), error) == (0, f"page in {os.path.join('run', 'report.html')}", "")
@@ -82,7 +84,7 @@ def test_a_run_becomes_a_page(command, simulated):
     assert command("report", "run", "--quiet") == (0, "", "")  # again, in place
 
 
-def test_the_body_turns_as_it_flew(simulated):
+def test_attitude_animation_of_the_page_equals_the_simulated_attitude(simulated):
     made = checked(simulated).charts["attitude"]
     rows = np.genfromtxt(simulated / "trajectory.csv", delimiter=",", names=True)
     times = np.array([float(frame["name"]) for frame in made["frames"]])
@@ -102,7 +104,7 @@ def test_the_body_turns_as_it_flew(simulated):
     ("not_converged", "bad", "the run failed: not converged"),
     ("diverged", "bad", "the run failed: diverged"),
 ])  # fmt: skip
-def test_the_verdict_is_the_first_content_of_the_page(simulated, status, mood, said):
+def test_the_verdict_is_the_first_content_of_the_report_page(simulated, status, mood, said):
     summary = json.loads((simulated / "summary.json").read_text())
     (verdict,) = (one for one in summary["verdicts"] if one["metric"] == "peak_torque")
     verdict |= {"limit": 30.0, "margin": 0.5, "met": True, "failures": 0}
@@ -124,12 +126,14 @@ def test_the_verdict_is_the_first_content_of_the_page(simulated, status, mood, s
     ("met", True, "good"), ("met", False, "calm"), ("ok", False, "calm"),
     ("diverged", False, "bad"), ("not met", False, "bad"), ("interrupted", True, "bad"),
 ])  # fmt: skip
-def test_what_failed_looks_bad_whether_or_not_anything_was_asked(status, asked, mood):
+def test_headline_of_a_failure_has_its_colour_with_and_without_requirements(status, asked, mood):
+    """If nothing failed, the colour is neutral without requirements, and good if all requirements are met."""
     verdicts = [examples.entry(Requirement("peak_torque", 0.5).verdict(np.zeros(2), np.ones(2, bool)))]
     assert report.headline(status, verdicts if asked else [])[1] == mood
 
 
-def test_the_headline_tells_requirements_that_are_not_met_from_those_that_are_not_shown():
+def test_headline_distinguishes_broken_requirements_from_too_few_trials():
+    """A quantile of 99 % with 90 % confidence needs 230 trials without a violation; 229 trials do not show it."""
     limit = Requirement("peak_torque", 0.5, quantile=0.99, confidence=0.9)
     shown, not_shown, not_met = (examples.entry(limit.verdict(np.full(count, value), np.ones(count, bool)))
                                  for count, value in ((230, 0.4), (229, 0.4), (230, 0.6)))  # fmt: skip
@@ -142,7 +146,7 @@ def test_the_headline_tells_requirements_that_are_not_met_from_those_that_are_no
 
 
 def hostile_folder(simulated):
-    """The same result as a user could have named everything in it."""
+    """Put HTML with a script into the names and texts of a result folder; return the renamed folder."""
     folder = simulated.with_name(re.sub("/", "", HOSTILE))
     simulated.rename(folder)
     summary = json.loads((folder / "summary.json").read_text())
@@ -157,7 +161,7 @@ def hostile_folder(simulated):
     return folder
 
 
-def test_what_a_user_typed_is_text(simulated):
+def test_html_in_names_and_texts_of_a_result_is_shown_as_text(simulated):
     plain = [tag for tag, _ in checked(simulated).found]
     folder = hostile_folder(simulated)
     read = checked(folder)  # which knows every element and attribute that may be there
@@ -167,7 +171,7 @@ def test_what_a_user_typed_is_text(simulated):
 
 
 def test_links_out_of_the_folder_and_other_files_than_pictures_are_not_embedded(command, simulated, tmp_path):
-    """A page is made to be sent, and a folder may come from anybody."""
+    """The page of a folder from another person must not embed private files of the reader, who may send the page."""
     picture = page.PNG_HEADER + b"secret"
     (tmp_path / "elsewhere.png").write_bytes(picture)
     (simulated / "figures" / "outside.png").symlink_to(tmp_path / "elsewhere.png")
@@ -196,7 +200,7 @@ def test_a_result_file_that_is_a_link_out_of_the_folder_is_refused(command, simu
 @pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
 @pytest.mark.parametrize("hostile", short([False, True], [True]))
 def test_chromium_draws_the_page_without_an_error_or_a_request(simulated, tmp_path, hostile):
-    """The policy forbids requests and foreign scripts. The console would show a forbidden attempt."""
+    """The policy of the page forbids requests and other scripts. The console of the browser would report an attempt."""
     folder = hostile_folder(simulated) if hostile else simulated
     place = tmp_path / "page.html"
     place.write_text(page.build(folder))
@@ -216,7 +220,7 @@ def test_chromium_draws_the_page_without_an_error_or_a_request(simulated, tmp_pa
     assert not any("hare" in title for title in re.findall(r'data-title="([^"]*)"', body))  # nothing is uploaded
 
 
-def test_what_is_no_result_is_refused(command, simulated, tmp_path):
+def test_report_refuses_folders_without_a_result_and_damaged_results(command, simulated, tmp_path):
     (tmp_path / "empty").mkdir()
     for folder, said in (
         ("none", "none is no folder"),
@@ -262,7 +266,7 @@ def test_what_is_no_result_is_refused(command, simulated, tmp_path):
 
 
 @pytest.mark.parametrize(("module", "name"), [(page_charts, "history"), (page.json, "dumps")])
-def test_an_error_of_the_page_itself_is_not_blamed_on_a_file(simulated, monkeypatch, module, name):
+def test_an_error_in_the_code_of_the_page_is_not_reported_as_a_damaged_file(simulated, monkeypatch, module, name):
     monkeypatch.setattr(module, name, raise_type_error)
     with pytest.raises(TypeError, match="of the code"):
         page.build(simulated)
@@ -272,14 +276,14 @@ def raise_type_error(*_, **__):
     raise TypeError("an error of the code")
 
 
-def test_without_plotly_it_says_how_to_install_it(command, simulated, monkeypatch):
+def test_report_without_plotly_names_the_command_that_installs_it(command, simulated, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "plotly.offline", None)
     code, _, error = command("report", "run")
     assert code == 2
     assert error == "ptsmc: the page needs plotly.offline: pip install 'ptsmc-jax[report]'\n"
 
 
-def test_a_long_history_is_thinned_and_what_is_not_finite_is_a_gap():
+def test_chart_of_a_long_history_has_fewer_points_and_gaps_at_values_that_are_not_finite():
     t = np.linspace(0.0, 50.0, 10 * page_charts.POINTS)
     columns = {"t": t, "x1": np.sin(t), "u1": np.where(t > 49.0, np.nan, t)}
     made = page_charts.history(columns, False, {"t_f": 35.0})
@@ -291,7 +295,7 @@ def test_a_long_history_is_thinned_and_what_is_not_finite_is_a_gap():
     assert [shape["x0"] for shape in made["layout"]["shapes"]] == [35.0]
 
 
-def test_other_plants_have_pages_too(command, tmp_path):
+def test_a_chain_has_a_report_page_with_its_own_figures_and_metrics(command, tmp_path):
     (tmp_path / "c.toml").write_text(SHORT_CHAIN)
     command("simulate", "c.toml", "--out", "chain", "--quiet")
     folder = tmp_path / "chain"
@@ -307,7 +311,7 @@ def test_other_plants_have_pages_too(command, tmp_path):
 
 
 @pytest.mark.parametrize(("values", "kind"), [([2.7, 3.05], None), ([1e-6, 4e-4], "log"), ([0.0, 5.0], None)])
-def test_an_axis_of_laws_has_numbers_on_it(values, kind):
-    """A logarithmic one names powers of ten: between 2.7 and 3.05 there is none."""
+def test_axis_of_a_chart_of_laws_is_logarithmic_only_if_it_contains_a_power_of_ten(values, kind):
+    """A logarithmic axis has numbers at powers of ten only: between 2.7 and 3.05 there is none."""
     made = page_charts.laws(["pd", "custom"], {"all": (values, [None, None])}, "effort [N m s]", {}, logarithmic=True)
     assert made["layout"]["xaxis"].get("type") == kind

@@ -13,7 +13,7 @@ from tuning.output import progress, terminal
 from tuning.output.report import Table
 
 
-def test_a_line_comes_also_while_nothing_new_is_said(capsys, monkeypatch):
+def test_progress_line_is_repeated_if_there_is_no_news(capsys, monkeypatch):
     """The last line is repeated with the elapsed time, for example while a law is compiled for minutes."""
     monkeypatch.setattr(progress, "INTERVAL", 0.05)
     with progress.Progress(quiet=False) as tell:  # the tests' output is no terminal
@@ -28,7 +28,7 @@ def test_a_line_comes_also_while_nothing_new_is_said(capsys, monkeypatch):
     assert not capsys.readouterr().err
 
 
-def test_a_line_has_the_number_of_steps(capsys, monkeypatch):
+def test_progress_line_has_the_number_of_steps(capsys, monkeypatch):
     monkeypatch.setattr(progress, "INTERVAL", 0.02)
     with progress.Progress(quiet=False) as tell:
         tell("searching", 1, 7)
@@ -95,14 +95,14 @@ def unread():
         yield stream
 
 
-def test_a_reader_that_has_read_enough_changes_nothing(unread, monkeypatch):
-    """As `head`: rich would exit with 1, which is the status of requirements that are not met."""
+def test_printing_into_a_closed_pipe_raises_no_error(unread, monkeypatch):
+    """A pipe to `head` closes early. Rich would exit with 1, the status of requirements that are not met."""
     monkeypatch.setattr("sys.stdout", unread)
     terminal.print_lines("told", "to nobody")
     terminal.print_table(Table(("head",), [("row",)]))
 
 
-def test_progress_that_nobody_reads_stops_nothing(unread, monkeypatch):
+def test_progress_into_a_closed_pipe_raises_no_error(unread, monkeypatch):
     monkeypatch.setattr("sys.stderr", unread)
     monkeypatch.setattr(progress, "INTERVAL", 0.01)
     with progress.Progress(quiet=False) as tell:
@@ -110,8 +110,8 @@ def test_progress_that_nobody_reads_stops_nothing(unread, monkeypatch):
         time.sleep(0.1)  # an error of its thread would be a warning, which fails the test
 
 
-def test_a_narrow_terminal_cuts_no_numbers(capsys, monkeypatch):
-    """Of 0.000194 it left 0.00 and three dots; sentences still break at their words."""
+def test_tables_in_a_narrow_terminal_have_complete_numbers(capsys, monkeypatch):
+    """An earlier version shortened 0.000194 to 0.00 and three dots. Only sentences break, between their words."""
     monkeypatch.setenv("FORCE_COLOR", "1")  # a terminal
     monkeypatch.setenv("COLUMNS", "40")
     row = ("peak_torque_delivered", "0.000194", "0.000382..0.00102", "N m s", "largest delivered torque about one axis")
@@ -133,7 +133,7 @@ def test_terminal_prints_text_as_it_is(capsys):
     assert "b:x:[bold]" in out
 
 
-def test_a_compilation_that_a_step_waits_for_is_named(capsys, monkeypatch):
+def test_progress_line_names_the_compilation_that_a_step_waits_for(capsys, monkeypatch):
     monkeypatch.setattr(progress, "INTERVAL", 0.02)
     monkeypatch.setattr(programs, "compiling", lambda: "compiling the gradients, 2 of 3")
     with progress.Progress(quiet=False) as tell:

@@ -52,6 +52,7 @@ def text_of(value: Any) -> str:
 
 
 def errors(rms: float, interval: Any = None, largest: float | None = None) -> dict[str, Any]:
+    """Return the statistics of a metric over trials, as a summary has them; interval: of the RMS."""
     return {"mean": rms, "rms": rms, "max": largest or rms, "rms_interval": interval}
 
 
@@ -72,20 +73,24 @@ def earlier(metric: str) -> dict[str, Any]:
 
 
 def advice(verdict: dict[str, Any], **search: Any) -> Iterable[str]:
+    """Return the advice of a tuning with this verdict on held-out trials; search: changes of its record."""
     return tune_report.advice_lines(
         examples.tune({"largest_over_limit": {verdict["metric"]: 0.99}, **search}, verdicts=[verdict])
     )
 
 
 def advice_on_time(interpretation: str) -> Iterable[Any]:
-    """3 % of the time beyond, 30 times as much as allowed, by errors of 1.1 of the limit; then a failed run."""
+    """Return the advice if a limit is exceeded by a tenth for 3 % of the time, and the advice if a run fails.
+
+    The limit may be exceeded for 0.1 % of the time.
+    """
     asked = Requirement("ape_x", 0.5, quantile=0.999, interpretation=interpretation)
     verdict = asked.verdict(np.full(4, 0.55), np.ones(4, bool), np.full(4, 0.97)).in_summary()
     return advice(verdict), advice({**verdict, "worst": None})
 
 
 def advice_on_margin(metric: str, limit: float, worst: float) -> Iterable[Any]:
-    """38 of 256 loops break the limit; then the verdict on one loop, which is the nominal one."""
+    """Return the advice if 38 of 256 loops break a limit of a margin, and the advice if the nominal loop breaks it."""
     asked = Requirement(metric, limit, at_least=metric != "peak_sensitivity", unit=MARGINS[metric].unit)
     verdict = asked.verdict(np.where(np.arange(256) < 38, worst, limit), np.ones(256, bool)).in_summary()
     return advice(verdict), advice({**verdict, "trials": 1})
@@ -100,6 +105,10 @@ def verified(count: int) -> Any:
 
 
 def conflict(**limits: float | None) -> Iterable[str]:
+    """Return the report of a search with limits that conflict.
+
+    limits: ratio of the metric to each limit if this limit is ignored and all others are kept, or None.
+    """
     found = {"largest_over_limit": {"peak_torque": 1.12, "gain_margin": 1.119}, "conflict": limits,
              "searched_globally": True}  # fmt: skip
     return tune_report.search_lines(examples.tune(found, verdicts=[examples.torque(1.1), MARGIN]))
@@ -113,10 +122,12 @@ def skipped(reached: float, **changes: Any) -> Iterable[str]:
 
 
 def accuracy(times: float | None, **changes: Any) -> Iterable[str]:
+    """Return the comparison of tuned with published gains; times: error of the published gains over the tuned error."""
     return tune_report.accuracy_lines(examples.tune(accuracy_gain_over_published=times, **changes))
 
 
 def searched(**search: Any) -> Iterable[str]:
+    """Return the report of a search with this record."""
     return tune_report.search_lines(examples.tune(search))
 
 
@@ -127,15 +138,18 @@ WORST_CASE = {"metric": "peak_torque", "ratio": 1.03, "unbounded": False, "break
 
 
 def shortest(theory: float | None, simulated: float | None, quantile: float | None = None) -> Any:
+    """Return the report of a tuning with the shortest t_f [s] for a torque limit by theory, simulation and quantile."""
     times = {"limit": 0.5, "theory": theory, "simulated": simulated, "quantile": quantile, "unit": "N m"}
     return tune_report.build(examples.tune(shortest_t_f=times))
 
 
 def diagnostics(at_bound: dict[str, str] | None = None, **trust: Any) -> Iterable[str]:
+    """Return the checks of a tuning that its report lists; at_bound: gains that ended at a bound."""
     return tune_report.diagnostic_lines(examples.tune(trust=trust, at_bound=at_bound or {}))
 
 
 def gains_by_axis(**tuned: float) -> Table:
+    """Return the table of gains of a chain with these tuned gains and one published gain of the observer."""
     paper = examples.group(gains={"observer_gain": 10.0})
     return tune_report.gain_table(examples.tune(plant="chain", published=paper, held_out=examples.group(gains=tuned)))
 
@@ -148,6 +162,7 @@ def fitted(least: float) -> Iterable[str]:
 
 
 def margins_of(required: bool = False, **ends: dict[str, Any]) -> Iterable[str]:
+    """Return the report of margins; ends: changes of the default margins in each phase, hold or before."""
     known = {"stable": True, "gain_margin": 6.0, "phase_margin": 30.0, "delay_margin": 0.1, "peak_sensitivity": 5.0}
     loops = {name: {**known, **changes} for name, changes in ends.items()}
     return margins_report.tuned_margin_lines(loops, required=required)
@@ -265,16 +280,19 @@ def front(*points: Point, **changes: Any) -> Front:
 
 
 def torque(limit: float, peak: float, rms: float, gains: Any = (("eta", 3.0),), **changes: Any) -> Point:
+    """Return a point of a front over limits of the torque [N m]."""
     return Point(limit, dict(gains), rms, costs={"peak_torque": peak, "mean_peak_torque": peak / 2}, **changes)
 
 
 def robust(limit: float, rms: float, **margins: float) -> Point:
+    """Return a point of a front over limits of the margins."""
     costs = {"gain_margin": 6.1, "phase_margin": 40.0, "delay_margin": math.inf, "peak_sensitivity": 5.8, **margins}
     interval = (0.95 * rms, 1.05 * rms)
     return Point(limit, {"eta": 3.0, "observer_gain_2": 25.0}, rms, interval, {"peak_torque": 0.2, **costs}, meets=True)
 
 
 def slew(t_f: float, rms: float, peak: float, **changes: Any) -> Point:
+    """Return a point of a front over the slew time t_f [s]."""
     return Point(t_f, {"eta": 3.0}, rms, (0.9 * rms, 1.1 * rms), {"peak_torque": peak}, **changes)
 
 
@@ -316,7 +334,7 @@ ERROR = {"without_value": 0, "rms": 1e-5, "max": 1e-5, "0.5": {"value": 1e-5, "l
 
 
 def fractions() -> Iterable[str]:
-    """59 of 60 trials keep the limit; a digit is lost if 98.33 % is rounded."""
+    """Return a verdict on a fraction of the trials, 59 of 60 or 98.33 %, and a verdict on fractions of time."""
     asked = Requirement("peak_torque", 0.5, quantile=0.95)
     verdict = asked.verdict(np.r_[np.zeros(59), 1.0], np.ones(60, bool))
     found = examples.entry(verdict, fraction=59 / 60, fraction_interval=[0.91056, 0.99957], fraction_bound=0.92333)
@@ -333,10 +351,12 @@ def settling(without: int) -> Iterable[Table]:
 
 
 def campaign_gains(**tables: dict[str, Any]) -> Table:
+    """Return the table of the gains of a campaign whose scenario has these tables."""
     return campaign_report.gain_table(tables, "spacecraft")
 
 
 def pairs(count: int, meets: float = math.nan) -> Iterable[str]:
+    """Return the report of a map with `count` pairs; meets: 1 if the pairs keep every requirement, NaN without any."""
     pair = {"status": "simulated", "failures": 0.0, "not_converged": 0.0, "window_error": 2e-6, "peak_torque": 0.3,
             "meets": meets, "not_met": ""}  # fmt: skip
     every = [
@@ -367,6 +387,8 @@ def map_of(plant: str) -> Report:
 
 
 def compared() -> Table:
+    """Return the comparison of two laws. 12 of 1000 trials of PD break a limit."""
+
     def law(failures: int, **changes: Any) -> dict[str, Any]:
         verdict = Requirement("peak_torque", 0.5).verdict(np.arange(1000) < failures, np.ones(1000, bool))
         return examples.law(window_error=1e-5, verdicts=[verdict.in_summary()], met=verdict.met, **changes)
@@ -405,6 +427,7 @@ def most_accurate_law(pd_error: float) -> str:
 
 
 def run(lower_bound: float | None) -> Report:
+    """Return the report of a single run with this lower bound of the error."""
     told = {"status": "ok", "reason": "", "bad_time": None, "window_error": 1e-5, "verdicts": [], "warnings": []}
     angles = {"window_angle": 2e-5, "hold_angle": 0.02, "peak_rate": 0.02}  # in arcsec, in deg, and no angle
     return reports.build("simulate", {**told, **angles, "lower_bound": lower_bound}, "spacecraft")
@@ -461,7 +484,10 @@ def worst_trials(by: str, **columns: list[Any]) -> Table:
 
 
 def why(*rows: dict[str, Any], **changes: Any) -> Iterable[str]:
-    """Return the reasons of a trial. Each row is an input, in which a category has a fraction of equal trials."""
+    """Return the explanation of a worst trial; each row is an unusual input.
+
+    The `fraction` of a row is the fraction of trials with the same category.
+    """
     alike = {"metric": "effort", "trial": 3, "value": None, "drawn": 2.0, "unit": "", "fraction": None, "median": 1.0,
              "percentile": None, "rank_correlation": None, "first_order": None, **changes}  # fmt: skip
     return campaign_report.explanation_lines([{**alike, **row} for row in rows], catalogues.units("spacecraft"))
@@ -586,11 +612,12 @@ NO_DRIVER = "no dispersed quantity alone explains 5 % of the variance of the ran
 
 
 def driver_lines(drivers, trials):
+    """Return the sentences of a campaign report on the inputs that drive the window error."""
     found = {"drivers": {"window_error": drivers}, "driver_trials": {"window_error": trials}}
     return list(campaign_report.driver_lines(examples.campaign(simulated=10_000, trials=10_000, **found)))
 
 
-def test_chance_is_no_driver():
+def test_inputs_that_correlate_by_chance_are_not_reported_as_drivers():
     """In an earlier version, some of twenty inputs without influence were named, with correlations of 0.1."""
     rng = np.random.default_rng(0)
     inputs, metric = {f"x{k}": rng.normal(size=300) for k in range(20)}, rng.normal(size=300)
@@ -603,7 +630,7 @@ def test_chance_is_no_driver():
 
 
 @pytest.mark.parametrize(("correlation", "trials", "named"), [(0.22, 1000, False), (0.3, 1000, True), (0.3, 90, False)])
-def test_driver_explains_a_significant_part_of_the_variance(correlation, trials, named):
+def test_an_input_is_a_driver_only_if_it_explains_a_significant_part_of_the_variance(correlation, trials, named):
     """A rank correlation of 0.22 explains 4.8 % of the variance. One of 0.3 is insignificant in 90 trials."""
     (line,) = driver_lines({"initial_angle": {"rank_correlation": correlation, "first_order": 0.0}}, trials)
     driven = "window_error is driven by initial_angle (rank correlation +0.30, 9 % of the variance of the ranks)"
@@ -616,11 +643,11 @@ def test_driver_without_a_monotonic_influence_has_no_rank_correlation():
     assert "disturbance_phase_1 (mostly not monotonic, 19 % of the variance of the ranks)" in line
 
 
-def test_constants_of_the_search_have_the_same_values():
+def test_constants_of_the_tuning_report_equal_those_of_the_search():
     assert (tune_report.CONFIDENT, tune_report.HOPELESS) == (100 * confirm.CONFIDENT, optimise.HOPELESS)
 
 
-def test_percentages_of_correlated_inputs_overlap():
+def test_report_states_that_percentages_of_correlated_inputs_overlap():
     """The initial angle and a component of the initial attitude explain 68 % and 52 % of the same variance."""
     drivers = {"initial_angle": {"rank_correlation": 0.8, "first_order": 0.68}}
     assert "overlap" not in driver_lines(drivers, 1000)[0]
@@ -647,7 +674,7 @@ def test_chart_of_a_search_shows_the_objective_in_the_unit_of_the_figures(plant,
 
 
 @pytest.mark.parametrize(("minimised", "label"), [("t_f", "t_f [s]"), ("effort", "RMS effort [N m s]")])
-def test_an_objective_has_its_unit(minimised, label):
+def test_label_of_an_objective_has_its_unit(minimised, label):
     assert style.objective_display(objective_name(Tune(minimise=minimised)), minimised, "spacecraft")[1] == label
 
 
@@ -655,7 +682,7 @@ if __name__ == "__main__":
     EXPECTED.write_text("\n\n".join(f"## {name}\n{text_of(case())}" for name, case in CASES.items()) + "\n")
 
 
-def test_a_list_of_sensors_has_no_gains():
+def test_table_of_gains_does_not_change_with_a_list_of_sensors():
     law = {"controller": {"kind": "prescribed_time", "eta": 3.0}}
     sensors = {"sensors": [{"kind": "star_tracker"}, {"kind": "gyro"}]}
     assert campaign_report.gain_table({**law, **sensors}, "spacecraft") == campaign_report.gain_table(law, "spacecraft")

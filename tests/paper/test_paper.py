@@ -18,15 +18,16 @@ from tuning.studies import reproduction
 
 @pytest.fixture(scope="module")
 def made():
+    """Return the reproduction of the paper: simulated cases, claims, errors in its formulas, and observers."""
     return reproduction.reproduce()
 
 
-def test_every_figure_of_the_paper_is_a_case():
+def test_every_figure_of_the_paper_belongs_to_one_simulated_case():
     numbers = [int(n) for figures, _, _ in claims.CASES.values() for n in figures.split(", ")]
     assert numbers == list(range(1, 11))
 
 
-def test_cases_match_the_reference_data(made):
+def test_errors_of_the_simulated_cases_match_an_independent_integration(made):
     """The independent integration uses c instead of sqrt(3) c in (55). The larger K2 reduces the error by a tenth."""
     by_name = {(c["t_f"], c["eta"]): c["summary"] for c in REFERENCE["cases"]}
     for name in claims.SPACECRAFT:
@@ -40,7 +41,7 @@ def test_cases_match_the_reference_data(made):
         )
 
 
-def test_verdicts_match_the_theory_notes(made):
+def test_verdicts_on_the_claims_of_the_paper_match_the_theory_notes(made):
     """The accuracy is better than claimed at t_f, worse after t_f, and not better for a larger eta."""
     told = {claim.claim.split(" (")[0]: claim for claim in made.claims}
     assert [claim.verdict for claim in made.claims].count("differs") == 3
@@ -59,7 +60,7 @@ def test_verdicts_match_the_theory_notes(made):
     assert settled["spread_disturbed"] > 0.3
 
 
-def test_a_verdict_depends_on_its_measurement(made, monkeypatch):
+def test_verdict_on_a_claim_of_the_paper_depends_on_the_simulated_runs(made, monkeypatch):
     """Other runs give other verdicts with the same text, so the verdicts are not fixed."""
     for measured in ("_check_independence_of_start", "_check_sampled_torque_peaks"):  # these claims need further runs
         monkeypatch.setattr(claims, measured, lambda *_: made.claims[0])
@@ -69,7 +70,7 @@ def test_a_verdict_depends_on_its_measurement(made, monkeypatch):
     assert told["so does a larger eta"] == "differs"
 
 
-def test_slips_show_the_stated_numbers(made):
+def test_errors_in_the_formulas_of_the_paper_have_the_stated_effects(made):
     values = {slip.where + slip.correct[:4]: slip.values for slip in made.slips}
     assert len(values) == len(made.slips)
     (expansion,) = [v for k, v in values.items() if k.startswith("(37)")]
@@ -124,7 +125,7 @@ def test_each_figure_has_the_number_and_the_content_of_the_paper(monkeypatch):
     assert set(drawn) == {*paper, *(f"convergence_{name}" for name in claims.CASES), "remark_2_observers"}
 
 
-def test_folder_holds_figures_claims_and_scenarios(made, tmp_path, monkeypatch):
+def test_folder_of_the_reproduction_contains_figures_claims_and_scenarios(made, tmp_path, monkeypatch):
     monkeypatch.setattr(Figure, "savefig", lambda self, path, **_: path.touch())  # the content is not tested here
     reproduction.write(tmp_path, made, figures=True)
     names = {path.name for path in (tmp_path / "figures").iterdir()}
@@ -149,7 +150,7 @@ def test_folder_holds_figures_claims_and_scenarios(made, tmp_path, monkeypatch):
     assert slips.__doc__
 
 
-def test_reproduce_writes_the_files_of_the_contract(made, command, tmp_path, monkeypatch):
+def test_reproduce_command_writes_its_files_and_refuses_an_existing_folder(made, command, tmp_path, monkeypatch):
     monkeypatch.setattr(reproduction, "reproduce", lambda: made)  # it takes as long as all other tests of this file
     status, out, err = command("reproduce", "--no-figures")
     assert (status, err) == (0, "")
@@ -165,6 +166,7 @@ def test_reproduce_writes_the_files_of_the_contract(made, command, tmp_path, mon
 
 
 def test_remark_2_matches_theory(made):
+    """Remark 2 claims that a smooth sign reduces chattering. The estimates of the observers match theory too."""
     by = {(one.observer, one.sign): one for one in made.observers}
     assert len(by) == 8
     k2 = {"none": 0.01 * 3**0.5, "nonlinear": 1e-3 * 3**0.5 * 14 / 10, "prescribed_time": 1e-3 * 3**0.5 * 14 / 10}

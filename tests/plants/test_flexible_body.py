@@ -40,10 +40,12 @@ SATELLITE = {
 
 
 def body(damping=DAMPING):
+    """Return a flexible body with four modes."""
     return flexible_body.flexible(INERTIA, FREQUENCY, damping, COUPLING)
 
 
 def state(seed):
+    """Return a random attitude, rate and state of the modes."""
     rng = np.random.default_rng(seed)
     q = rng.normal(size=4)
     modes = flexible_body.Modes(vector(rng.normal(size=4)), vector(rng.normal(size=4)))
@@ -69,7 +71,7 @@ def simulated():
     return runs.simulate(replace(ready, parts=replace(ready.parts, substeps=FINE)))
 
 
-def test_a_run_matches_an_independent_integration(simulated):
+def test_run_of_a_flexible_body_matches_an_independent_integration(simulated):
     log, D = simulated.log, np.array(COUPLING)
     modes = log.x.modes
     y = np.concatenate([log.x.q[0], log.x.w[0], np.zeros(4), D @ log.x.w[0]])
@@ -105,7 +107,7 @@ def test_default_steps_keep_modes_accurate_to_a_millionth_for_given_torques(simu
     np.testing.assert_allclose(found.q, log.x.q[1:], rtol=0, atol=1e-7)
 
 
-def test_metrics_and_columns_of_the_modes(simulated):
+def test_metrics_and_columns_of_the_modes_match_the_history(simulated):
     log, metrics = simulated.log, simulated.metrics
     size = np.sqrt(np.sum(log.x.modes.e**2 + (log.x.modes.rate / FREQUENCY) ** 2, axis=1))
     np.testing.assert_allclose(metrics["peak_modal"], size.max(), rtol=1e-13)
@@ -174,7 +176,7 @@ def test_a_random_inertia_changes_the_inertia_without_modes_and_an_impossible_bo
 
 
 @pytest.mark.parametrize("too_far", [(0,), (1,), (2,), (0, 1), (0, 2), (1, 2), (0, 1, 2)])
-def test_inverse_is_nan_if_the_modes_have_more_inertia_than_the_body(too_far):
+def test_inverse_inertia_is_nan_if_the_modes_have_more_inertia_than_the_body(too_far):
     """With two such axes, the determinant of J - D'D is positive again."""
     coupling = np.diag([1.5 if axis in too_far else 0.5 for axis in range(3)])
     plain = flexible_body.flexible(4.0 * np.eye(3), [1.0] * 3, [0.01] * 3, coupling)
@@ -182,7 +184,7 @@ def test_inverse_is_nan_if_the_modes_have_more_inertia_than_the_body(too_far):
     assert np.all(np.isnan(plain.with_inertia(one, one).rest_inverse))
 
 
-def test_moved_and_apart_are_inverse_functions():
+def test_retract_and_local_coordinates_of_a_flexible_body_are_inverse_functions():
     plant, x = body(), state(2)
     by = vector(1e-7 * np.random.default_rng(0).normal(size=14))
     np.testing.assert_allclose(plant.local_coordinates(x, plant.retract(x, by)), by, rtol=0, atol=1e-14)

@@ -60,7 +60,7 @@ def test_a_rotation_of_more_than_a_radian_per_step_is_too_fast(dt):
         assert bool(body.is_too_fast(rigid_body.AttitudeState(still, w), vector(dt))) == too_fast
 
 
-def test_normalise_changes_only_the_norm():
+def test_normalise_changes_only_the_norm_of_the_quaternion():
     x = rigid_body.AttitudeState(vector([0.1, 0.2, -0.3, 0.4]), vector([1.0, 2.0, 3.0]))
     got = rigid_body.spacecraft(PAPER_INERTIA).normalise(x)
     np.testing.assert_allclose(got.q, np.array([1, 2, -3, 4]) / np.sqrt(30), rtol=4 * EPS)
@@ -70,7 +70,7 @@ def test_normalise_changes_only_the_norm():
 # as a part
 
 
-def test_three_moments_give_a_diagonal_tensor():
+def test_three_moments_of_inertia_give_a_diagonal_tensor():
     np.testing.assert_array_equal(formulas.check_inertia([1, 2, 2.5]), np.diag([1, 2, 2.5]))
 
 
@@ -134,7 +134,7 @@ def test_values_that_are_no_inertia_are_refused(inertia, reason):
             build(inertia)
 
 
-def test_rounding_does_not_break_symmetry():
+def test_an_inertia_that_is_symmetric_except_for_rounding_becomes_symmetric():
     tensor = np.array(FULL_INERTIA)
     tensor[0, 1] *= 1 + 1e-15
     got = formulas.check_inertia(tensor)
@@ -165,6 +165,7 @@ PLANTS = {
 
 @pytest.mark.parametrize("name", PLANTS)
 def test_the_input_for_an_acceleration_and_the_unexplained_torque_are_consistent(name):
+    """The input gives the requested acceleration, and the disturbance computed from the motion is the true one."""
     plant, x = PLANTS[name]
     t, (w_dot, d) = vector(0.6), np.random.default_rng(5).normal(size=(2, plant.inputs))
     u = plant.input_for(t, x, vector(w_dot), vector(d))
@@ -174,7 +175,7 @@ def test_the_input_for_an_acceleration_and_the_unexplained_torque_are_consistent
     np.testing.assert_allclose(plant.implied_disturbance(t, x, x_dot, u), d, rtol=0, atol=unit)
 
 
-def test_only_indices_out_of_range_are_reported():
+def test_check_indices_refuses_only_indices_out_of_range():
     given = {"a": vector([1.0, 2.0, 3.0])}, 2.0
     for beyond in (3, -4):
         with pytest.raises(IndexError, match=f"index {beyond} is out of bounds"):

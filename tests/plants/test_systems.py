@@ -105,6 +105,7 @@ GAINS = {"eta": 3.0, "delta": 0.05, "k1": 1.0, "surface_rate": 1.0, "sign_width"
 
 
 def arm_tables(**changes):
+    """Return the scenario of a two-link arm with changes in its tables."""
     tables = {
         "plant": {"kind": "system", "system": ARM, "x0": [0.8, -1.0, 0.5, 0.2]},
         "controller": {"t_f": 3.0, **GAINS, "disturbance_rate_bound": 0.6, "disturbance_bound": 0.45},
@@ -116,7 +117,7 @@ def arm_tables(**changes):
 
 
 @pytest.mark.parametrize("mode", short(["continuous", "sampled"], ["sampled"]))
-def test_the_arm_stays_inside_its_envelope(mode):
+def test_error_of_the_two_link_arm_stays_below_its_bound(mode):
     ready = scenario.study(scenario.from_tables(arm_tables(loop={"mode": mode, "period": 0.002})))
     result = fly(ready.parts)
     assert result.status == rollout.OK
@@ -174,6 +175,7 @@ def test_a_run_that_meets_a_singular_input_gain_is_marked_with_the_time(mode):
 
 
 def no_linear_rate(t, x_1, x_2):
+    """Return x_1' of a system that is not linear in x_2."""
     return jnp.sinh(x_2) - 0.1 * jnp.sin(t) + 0.2 * x_1[::-1]
 
 
@@ -296,6 +298,7 @@ def test_systems_from_python_and_from_files_survive_replace(tmp_path: Path):
 
 
 def study(system, x0, **tables):
+    """Return the study of a custom system with this initial state."""
     return scenario.study(scenario.from_tables({"plant": {"kind": "system", "system": system, "x0": x0}, **tables}))
 
 
@@ -308,7 +311,7 @@ FAST = [one_coordinate(H=lambda t, a, b: -60 * b), one_coordinate(H=lambda t, a,
 
 
 @pytest.mark.parametrize("system", short(FAST, FAST[1:]))
-def test_steps_follow_the_fast_modes_of_a_plant(system):
+def test_integration_steps_resolve_the_fast_modes_of_a_system(system):
     loop = {"loop": {"mode": "sampled", "period": 0.05}, "controller": {"delta": 0.3, "disturbance_bound": 0.0}}
     run = study(system, [1.0, 0.0], **loop).parts
     ours, finer_steps = fly(run), fly(replace(run, substeps=8 * run.substeps))
@@ -319,7 +322,7 @@ def test_steps_follow_the_fast_modes_of_a_plant(system):
 
 
 @pytest.mark.parametrize("w", short([10.0, 20.0], [20.0]))
-def test_steps_follow_the_explicit_time_of_a_system(w):
+def test_integration_steps_resolve_a_system_that_depends_on_time(w):
     system = one_coordinate(F=lambda t, a, b: b - jnp.cos(w * t))
     tables = {"controller": {"t_f": 30.0, "disturbance_bound": 0.0}}
     run = study(system, [1.0, 0.0], **tables).parts
@@ -353,7 +356,7 @@ BOTH = second_order.system(2, lambda t, a, b: b, lambda t, a, b: 0 * a, lambda t
         (HALF, [1.0, 0.2, 0.0, 0.0], "continuous", False),
     ],
 )
-def test_singularity_is_relative_to_the_start_in_any_units(system, x0, mode, singular):
+def test_singularity_of_a_system_is_relative_to_its_initial_state_in_any_units(system, x0, mode, singular):
     run = study(system, x0, controller={"disturbance_bound": 0.0}, loop={"mode": mode}).parts
     assert fly(run).status == (rollout.SINGULAR if singular else rollout.OK)
 
@@ -380,7 +383,7 @@ def test_functions_that_are_not_finite_at_the_start_are_refused_by_name(changes,
         study(one_coordinate(**changes), [1.0, 0.0])
 
 
-def test_a_hidden_state_of_a_truth_that_is_not_finite_at_the_start_is_refused():
+def test_a_true_plant_whose_hidden_state_is_not_finite_at_the_start_is_refused():
     late = {"H": lambda t, a, b, z: 0 * a, "Z": lambda t, a, b, z, u: u / b, "z0": [0.0]}
     truth = second_order.system(1, lambda t, a, b: b, G=lambda t, a, b: jnp.eye(1), **late)
     tables = {"kind": "system", "system": one_coordinate(), "truth": truth, "x0": [1.0, 0.0]}
@@ -413,7 +416,7 @@ def test_custom_files_can_import_helpers_and_cannot_exit_the_command(tmp_path):
     assert systems.checksum(spacecraft_as_system(SPIN)) is None
 
 
-def test_a_written_system_from_python_cannot_be_read(tmp_path):
+def test_a_written_scenario_with_a_system_made_in_python_cannot_be_read(tmp_path):
     tables = {"plant": {"kind": "system", "system": spacecraft_as_system(SPIN), "x0": [0.1, 0.0, 0.0, 0.0, 0.0, 0.0]}}
     made = scenario.from_tables(tables)
     store.write_toml(tmp_path / "s.toml", parsing.dump(made))
@@ -422,7 +425,7 @@ def test_a_written_system_from_python_cannot_be_read(tmp_path):
     assert store.read_previous_summary(tmp_path, parsing.dump(made), {"command": "tune", "seed": 0}) is None
 
 
-def test_steps_follow_the_run_with_the_shortest_t_f_of_a_search(monkeypatch):
+def test_integration_steps_suit_the_run_with_the_shortest_t_f_of_a_search(monkeypatch):
     tables = {
         "plant": {"kind": "system", "system": ARM, "x0": [0.8, -1.0, 0.0, 0.0]},
         "controller": {"t_f": 3.0, **GAINS},
