@@ -14,6 +14,7 @@ CUSTOM = 'plant = { kind = "system", system = "%s" }'
 
 
 def _read():
+    """Yield each scenario of bad_scenarios.txt with the expected parts of its error message."""
     blocks = Path(__file__).with_suffix(".txt").read_text(encoding="utf-8").split("\n\n")
     for block in blocks:
         *lines, of_what, allowed = (line for line in block.splitlines() if not line.startswith("# "))

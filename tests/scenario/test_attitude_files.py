@@ -28,7 +28,7 @@ META = {
 
 
 def message(rows, version="1.0", dates=DATES, marks=True, **changed):
-    """An attitude ephemeris message with other keywords; None: without the keyword."""
+    """Return the text of an attitude ephemeris message; changed: values of its keywords, None removes one."""
     meta = {name: value for name, value in (META | changed).items() if value is not None}
     lines = [f"{name} = {value}" for name, value in meta.items()]
     data = [f"{date} {' '.join(f'{number:.15f}' for number in row)}" for date, row in zip(dates, rows, strict=True)]
@@ -48,12 +48,14 @@ def write_and_read(path, content, order=None, direction=None, interpolation="fil
 
 
 def check(samples, quaternions=Q):
+    """Assert that samples of an attitude file have the times `TIMES` and these quaternions."""
     np.testing.assert_allclose(samples.times, TIMES, atol=1e-9)
     off = Rotation.from_quat(quaternions).inv() * Rotation.from_quat(samples.quaternions)
     assert off.magnitude().max() < 1e-12
 
 
 def columns(names, values):
+    """Return a column of a table for each name, from the columns of an array."""
     return dict(zip(names, values.T, strict=True))
 
 
@@ -77,11 +79,11 @@ TABLES = {
 
 @pytest.mark.parametrize(("frame", "options"), TABLES.values(), ids=TABLES)
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
-def test_tables_in_every_order_give_the_same_attitudes(tmp_path, suffix, frame, options):
+def test_attitude_tables_with_any_names_and_order_of_columns_give_the_same_attitudes(tmp_path, suffix, frame, options):
     check(write_and_read(tmp_path / f"attitude.{suffix}", frame, **options))
 
 
-def test_epoch_is_the_time_0_of_calendar_times(tmp_path):
+def test_epoch_is_the_time_0_of_calendar_times_in_an_attitude_file(tmp_path):
     frame = TABLES["dates"][0]
     assert write_and_read(tmp_path / "a.csv", frame, epoch="2026-03-21T00:00:00").times[0] == pytest.approx(
         -2.0, abs=1e-12
@@ -125,14 +127,14 @@ MESSAGES = {
 
 
 @pytest.mark.parametrize(("text", "quaternions"), MESSAGES.values(), ids=MESSAGES)
-def test_messages_in_every_style_give_the_same_attitudes(tmp_path, text, quaternions):
+def test_attitude_messages_in_every_style_give_the_same_attitudes(tmp_path, text, quaternions):
     samples = write_and_read(tmp_path / "attitude.aem", text)
     check(samples, quaternions)
     if samples.end_rates is not None:
         np.testing.assert_allclose(samples.end_rates, np.deg2rad(RATE[:2]), atol=1e-12)
 
 
-def test_segments_are_chosen_by_the_epoch_and_not_joined(tmp_path):
+def test_the_epoch_selects_one_segment_of_an_attitude_message(tmp_path):
     later = [date.replace("03-20", "03-25").replace("03-21", "03-26") for date in DATES]
     second = message(S, dates=later, START_TIME=later[0], STOP_TIME=later[-1], USEABLE_STOP_TIME=later[-2])
     both = message(Q) + second[second.index("META_START") :]
@@ -166,12 +168,12 @@ REFUSED = {
 
 
 @pytest.mark.parametrize(("text", "named"), REFUSED.values(), ids=REFUSED)
-def test_messages_that_cannot_be_followed_are_refused_with_their_place(tmp_path, text, named):
+def test_unsupported_or_damaged_attitude_messages_are_refused_with_the_reason(tmp_path, text, named):
     with refuses(ValueError, named):
         write_and_read(tmp_path / "attitude.aem", text)
 
 
-def test_another_interpolation_is_allowed_by_key(tmp_path):
+def test_a_key_replaces_the_unsupported_interpolation_of_an_attitude_message(tmp_path):
     check(write_and_read(tmp_path / "a.aem", message(Q, INTERPOLATION_METHOD="LINEAR"), interpolation="spline"))
 
 
@@ -192,7 +194,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize(("frame", "named"), BROKEN.values(), ids=BROKEN)
-def test_broken_tables_are_configuration_errors_with_their_place(tmp_path, frame, named):
+def test_broken_attitude_tables_are_configuration_errors_of_the_key_of_the_file(tmp_path, frame, named):
     path = tmp_path / "attitude.csv"
     frame.write_csv(path)
     with refuses(ScenarioError, named) as caught:
@@ -200,7 +202,7 @@ def test_broken_tables_are_configuration_errors_with_their_place(tmp_path, frame
     assert caught.value.key == "reference.file"
 
 
-def test_runs_beyond_the_file_are_configuration_errors(tmp_path):
+def test_runs_beyond_the_end_of_an_attitude_file_are_configuration_errors(tmp_path):
     path = tmp_path / "attitude.csv"
     GOOD.write_csv(path)
     tables = {"reference": {"kind": "table", "file": str(path)}, "controller": {"t_f": 4.0, "error": "multiplicative"}}
@@ -210,14 +212,14 @@ def test_runs_beyond_the_file_are_configuration_errors(tmp_path):
     assert error.value.key == "loop.t_end"
 
 
-def test_relative_paths_start_at_the_scenario_file(tmp_path):
+def test_relative_paths_of_attitude_files_start_at_the_scenario_file(tmp_path):
     GOOD.write_csv(tmp_path / "attitude.csv")
     (tmp_path / "s.toml").write_text('[reference]\nkind = "table"\nfile = "attitude.csv"\n[controller]\nt_f = 4.0\n')
     read: Any = scenario.read(tmp_path / "s.toml")
     assert read.reference.file == str((tmp_path / "attitude.csv").resolve())
 
 
-def test_written_messages_are_read_back_with_equal_numbers(tmp_path):
+def test_written_attitude_messages_are_read_back_with_equal_numbers(tmp_path):
     rates = np.deg2rad(RATE)
     text = aem.format_message("SAT", TIMES, S, rates, "2026-03-20T12:00:00")
     found = aem.read_segment(text)
@@ -229,7 +231,7 @@ def test_written_messages_are_read_back_with_equal_numbers(tmp_path):
     assert found.usable_until == TIMES[-1]
 
 
-def test_an_independent_package_reads_the_same_numbers_of_written_messages():
+def test_an_independent_package_reads_the_same_numbers_of_written_attitude_messages():
     """CCSDS-NDM reads quaternions, their derivatives and times."""
     ndm_io = pytest.importorskip("ccsds_ndm.ndm_io")
     text = aem.format_message("SAT", TIMES, S, np.deg2rad(RATE), "2026-03-20T23:59:58")

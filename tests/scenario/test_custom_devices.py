@@ -85,6 +85,7 @@ pytestmark = pytest.mark.usefixtures("here")
 
 
 def parts_of(**tables):
+    """Return the parts of a chain under a PD law with these tables."""
     return scenario.study(scenario.from_tables({**CHAIN, **tables})).parts
 
 

@@ -53,11 +53,12 @@ pytestmark = pytest.mark.usefixtures("here")
 
 
 def made(file, name) -> Any:
-    """Load an object from a file of the test."""
+    """Return the object with this name in a file of the test."""
     return systems.load_object(f"{file}:{name}", systems.NAME_FORMS)
 
 
 def simulated(tables, record=True):
+    """Return the simulated run of a scenario, with its history by default."""
     return rollout.simulate_parts(scenario.study(scenario.from_tables(tables)).parts, record=record)
 
 
@@ -78,7 +79,7 @@ def test_the_published_law_as_a_custom_law_gives_the_same_run(plant):
         np.testing.assert_allclose(mine, builtin, rtol=1e-9, atol=1e-10)
 
 
-def test_a_custom_part_can_be_registered_as_a_pytree_already(here):
+def test_a_class_that_is_a_registered_pytree_can_be_a_custom_part(here):
     """Classes that are used from Python can be registered by the user."""
     (here / "said.py").write_text(
         "from dataclasses import dataclass\nfrom ptsmc_jax.numerics.pytrees import pytree\n"
@@ -91,7 +92,7 @@ def test_a_custom_part_can_be_registered_as_a_pytree_already(here):
     assert one.metrics.effort == other.metrics.effort > 0.0
 
 
-def test_reading_runs_no_code_and_completing_finds_keys_gains_and_bounds():
+def test_reading_a_scenario_runs_no_custom_code_and_completing_it_finds_keys_gains_and_bounds():
     (systems.Path("mine.py")).write_text(HEAD + "raise RuntimeError('was run')\n" + LAW)
     tables = {**CHAIN, "controller": {**MINE, "k1": 2}, "tune": {"trials": 8}}
     loaded = scenario.from_tables(tables)
@@ -246,8 +247,8 @@ def test_only_declared_numbers_of_a_custom_disturbance_are_dispersed(here, what)
 
 
 @pytest.mark.parametrize("beside", ["none", "random_walk"])
-def test_a_custom_disturbance_is_checked_beside_terms_without_a_signal(here, beside):
-    """The sum of both is then the custom disturbance itself."""
+def test_sum_of_a_custom_disturbance_and_a_term_without_a_signal_is_the_custom_disturbance(here, beside):
+    """A random walk is not a function of time, so it is not part of the sum."""
     (here / "other.py").write_text(HEAD + OTHER)
     terms = [{"kind": "custom", "code": "other.py:Wave"}, {"kind": beside}]
     ready = scenario.study(scenario.from_tables({**CHAIN, "disturbance": {"kind": "sum", "terms": terms}}))
@@ -429,7 +430,7 @@ def test_errors_in_other_custom_parts_are_one_sentence(here, name, old, new, sai
     assert "\n" not in str(caught.value)
 
 
-def test_a_file_that_names_a_class_from_python_cannot_be_read(here):
+def test_a_written_scenario_with_a_class_made_in_python_cannot_be_read(here):
     made_here = ptsmc.replace(
         scenario.from_tables(CHAIN), controller={"kind": "custom", "code": made("mine.py", "Mine")}
     )
@@ -438,7 +439,7 @@ def test_a_file_that_names_a_class_from_python_cannot_be_read(here):
         scenario.read("s.toml")
 
 
-def test_late_errors_in_custom_code_are_one_sentence(command, here, monkeypatch):
+def test_errors_in_custom_code_during_a_run_are_one_sentence(command, here, monkeypatch):
     """JAX finds a traced number in a list during the run. The error names the custom file."""
     monkeypatch.setattr(systems, "_executed_paths", set())
     kept = LAW.replace("        left =", "        kept.append(error)\n        error = kept[-4:][0]\n        left =")
@@ -461,7 +462,7 @@ def test_late_errors_in_custom_code_are_one_sentence(command, here, monkeypatch)
     assert systems.find_faulty_file(no_slopes.value) == str(here / "mine.py")
 
 
-def test_an_absent_file_is_refused_and_not_reported_as_run(command, here):
+def test_an_absent_custom_file_is_refused_and_not_reported_as_run(command, here):
     (here / "s.toml").write_text(SHORT_CUSTOM.replace("mine.py", "my/laws.py"))
     code, _, error = command("simulate", "s.toml")
     assert code == 2
@@ -505,7 +506,8 @@ def test_a_scenario_without_gains_is_refused_before_a_search(command, here):
 
 
 @pytest.mark.long
-def test_the_command_tunes_a_custom_law(command, here, monkeypatch):
+def test_tune_command_changes_gains_of_a_custom_law_and_copies_its_file(command, here, monkeypatch):
+    """With the copy, the tuned scenario runs on another computer, but only with the option --trust."""
     small_search(monkeypatch)
     (here / "s.toml").write_text(SHORT_CUSTOM)
     assert command("tune", "s.toml", "--no-figures")[0] in (0, 1)
@@ -521,7 +523,7 @@ def test_the_command_tunes_a_custom_law(command, here, monkeypatch):
     assert error == f"ptsmc: runs {here}/sent/mine.py, which controller.code of sent/tuned.toml names\n"
 
 
-def test_a_law_integrates_the_error_in_its_memory():
+def test_a_custom_law_integrates_the_error_in_its_memory():
     """The result equals the same sum by hand."""
 
     class Integral(ptsmc.AccelerationLaw):
@@ -544,7 +546,7 @@ def test_a_law_integrates_the_error_in_its_memory():
 
 
 @pytest.mark.parametrize("clock", ["anchored", "flight"])
-def test_the_first_sample_of_a_law_sees_the_initial_error(clock):
+def test_the_first_sample_of_a_custom_law_has_the_initial_error(clock):
     """The anchored clock begins with periods of length zero, which must not change the memory."""
 
     class InitialErrorLaw(ptsmc.AccelerationLaw):
@@ -566,7 +568,7 @@ def test_the_first_sample_of_a_law_sees_the_initial_error(clock):
     np.testing.assert_array_equal(np.asarray(log.s)[kept], np.asarray(log.x)[kept][0, 0])
 
 
-def test_a_commented_scenario_keeps_custom_keys(command, here):
+def test_new_like_a_scenario_keeps_the_keys_of_custom_parts(command, here):
     for name in ("own_parts.toml", "own_parts.py"):
         shutil.copy(ROOT / "scenarios" / name, here)
     assert command("new", "commented.toml", "--like", "own_parts.toml", "--quiet")[0] == 0
@@ -583,8 +585,8 @@ def test_fields_of_custom_base_classes_are_keys(here):
     assert scenario.study(whole).parts.controller.eta == 2.5
 
 
-def test_helper_modules_come_from_the_folder_of_the_file_and_are_current(tmp_path):
-    """Two folders have a helper of the same name, then a helper changes. The commanded acceleration shows which ran."""
+def test_custom_files_import_current_helper_modules_of_their_own_folder(tmp_path):
+    """Two folders have a helper with the same name. The acceleration that the law commands shows which helper ran."""
     law = "import helper\n" + HEAD + LAW.replace("return 0.5 * wanted", "return helper.K * wanted")
     for folder, k in (("a", 1.0), ("b", 3.0)):
         (tmp_path / folder).mkdir()
@@ -636,8 +638,8 @@ class Detumbling(ptsmc.AccelerationLaw):
 """
 
 
-def test_a_law_that_computes_its_own_torque_has_no_singularity(here):
-    """An earlier version reported it as singular at an attitude error of 180 deg, where only the inversion is."""
+def test_a_custom_law_that_returns_a_torque_has_no_singularity(here):
+    """An earlier version reported a singularity at an attitude error of 180 deg, where only accelerations have one."""
     (here / "mine.py").write_text(HEAD + DETUMBLING)
     law = {"kind": "custom", "code": "mine.py:Detumbling", "t_f": 5.0}
     tables = {"controller": law, "loop": SAMPLED, "initial": {"rotvec_deg": [0.0, 0.0, 150.0]}}

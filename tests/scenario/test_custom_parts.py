@@ -50,21 +50,22 @@ def reported(place, by="mine.toml"):
 
 @pytest.fixture(autouse=True)
 def fresh(monkeypatch):
-    """No custom file counts as run yet."""
+    """Clear the record of custom files that have run."""
     monkeypatch.setattr(systems, "_executed_files", {})
 
 
 @pytest.fixture(scope="module")
 def places(tmp_path_factory):
-    """A folder, and a folder for a copy of its content."""
+    """Return the path of a folder, and a path for a copy of it."""
     return tmp_path_factory.mktemp("home"), tmp_path_factory.mktemp("kept") / "home"
 
 
 @pytest.fixture
 def home(command, places, monkeypatch):
-    """The current folder, with a campaign whose scenario and metrics name my.py. `ran` is False in it.
+    """Change to a folder with a campaign whose scenario and metrics use the custom file my.py; return the folder.
 
     The campaign runs once, and its folder is restored for each test, because results name files by their path.
+    The marker that my.py writes when it runs is absent.
     """
     place, kept = places
     if kept.exists():
@@ -86,12 +87,12 @@ def home(command, places, monkeypatch):
 
 @pytest.fixture
 def simulated(home):
-    """The folder of the campaign."""
+    """Return the result folder of the campaign."""
     return home / FOLDER
 
 
 def ran(folder):
-    """Whether my.py has run since the last call."""
+    """Return whether my.py has run since the last call."""
     marker = folder / "my.ran"
     found = marker.exists()
     marker.unlink(missing_ok=True)
@@ -121,7 +122,7 @@ def test_summarize_worst_and_report_run_no_custom_code(command, simulated, home)
     assert "--metrics my.py:farthest" in page
 
 
-def test_rows_can_be_read_without_the_custom_file(command, simulated, home):
+def test_summarize_worst_and_report_work_without_the_custom_file(command, simulated, home):
     (home / "my.py").unlink()
     for asked in ("summarize", "worst", "report"):
         assert command(asked, FOLDER)[0] == 0, asked
@@ -158,7 +159,7 @@ def test_a_changed_custom_file_is_refused_even_with_trust(command, simulated, ho
     assert not ran(simulated)
 
 
-def test_the_same_campaign_resumes_without_a_flag(command, simulated, home):
+def test_montecarlo_resumes_its_campaign_without_the_option_trust(command, simulated, home):
     code, _, error = command(
         "montecarlo", "mine.toml", "--trials", 30, "--metrics", "my.py:farthest", "--no-figures", "--quiet"
     )
@@ -197,7 +198,8 @@ def test_a_scenario_in_results_needs_trust_wherever_its_file_is(command, simulat
         ("package.module:mine", "the module package.module"),
     ],
 )
-def test_every_program_of_a_users_scenario_is_reported(tmp_path, capsys, system, runs):
+def test_the_path_of_a_custom_file_in_a_users_scenario_is_reported(tmp_path, capsys, system, runs):
+    """The scenario is not in a result folder, so no trust is needed."""
     home = tmp_path / "home"
     (home / "below").mkdir(parents=True)
     for folder in (tmp_path, home, home / "below"):
@@ -272,6 +274,7 @@ def test_inconsistent_result_folders_are_refused_in_one_sentence(command, tmp_pa
 
 
 def _tables(*codes):
+    """Return the tables of a scenario that uses these files: the first as its law, the others as disturbances."""
     laws = [{"kind": "custom", "code": str(code)} for code in codes]
     return {"controller": laws[0], "disturbance": {"terms": laws[1:]}} if laws[1:] else {"controller": laws[0]}
 

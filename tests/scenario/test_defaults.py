@@ -24,12 +24,14 @@ SAMPLED = {"mode": "sampled", "period": 0.1}
 
 
 def free(said):
+    """Return the names of the free gains of a scenario."""
     assert said.tune is not None
     assert said.tune.free is not None
     return said.tune.free
 
 
 def bounds(**tables):
+    """Return the default bounds of the disturbance and of its rate in a scenario."""
     law = reading.complete(scenario.from_tables(tables)).controller
     return law.disturbance_bound, law.disturbance_rate_bound
 
@@ -276,7 +278,7 @@ QUIET = {"kind": "constant", "amplitude": [1e-6] * 3}
     ],
     ids=str,
 )  # fmt: skip
-def test_unusual_bounds_and_noisy_estimates_cause_a_warning(tables, said):
+def test_unusual_disturbance_bounds_and_noisy_estimates_cause_a_warning(tables, said):
     found = plausibility.warnings(scenario.from_tables(tables))
     assert len(found) == bool(said)
     assert all(words in found[0] for words in said)
@@ -293,7 +295,7 @@ def test_an_estimate_with_more_noise_than_the_disturbance_causes_a_warning(share
 
 
 @pytest.mark.parametrize("rate_noise", [1e-3, 1e-1])
-def test_the_default_gain_of_the_observer_causes_no_warning(rate_noise):
+def test_the_default_gain_of_the_observer_causes_no_warning_about_a_noisy_estimate(rate_noise):
     """No smaller gain helps: within t_f the estimate must approach the disturbance."""
     tables = {**NOISY, "hardware": {"attitude_noise": 1e-5, "rate_noise": rate_noise}}
     default = scenario.from_tables(tables)
@@ -303,7 +305,7 @@ def test_the_default_gain_of_the_observer_causes_no_warning(rate_noise):
     assert any("try a smaller gain" in one for one in plausibility.warnings(larger))
 
 
-def test_the_predicted_noise_of_the_estimate_matches_the_observer():
+def test_the_predicted_noise_of_the_estimate_matches_a_simulated_observer():
     """Run the digital observer on 40000 samples of noise. Chance changes an axis by at most 1 % (3 sigma)."""
     gain, h, sigma = [0.05, 0.2, 1.0], 0.1, 1e-4
     tables = {**NOISY, "observer": {"gain": gain}}
@@ -321,7 +323,7 @@ def test_the_predicted_noise_of_the_estimate_matches_the_observer():
     )
 
 
-def test_probe_values_beyond_a_bound_stay_in_the_allowed_range():
+def test_the_value_of_a_gain_beyond_its_search_bound_is_allowed_or_none():
     """The value is a tenth of the interval beyond the bound, or None if the reason of the bound is known."""
     said = scenario.from_tables({"loop": SAMPLED, "tune": {"bounds": {"eta": [2.05, 8.0], "delta": [0.1, 10.0]}}})
     assert free_gains.value_beyond_bound(said, "eta", "upper") == pytest.approx(8.595)
@@ -424,7 +426,7 @@ def test_a_noisy_star_tracker_with_a_perfect_gyro_causes_a_warning(hardware, sai
     [(1e7, "torque limit allows"), (1e4, "torque limit allows"), (1.0, None), (1e-7, "rad in one")],
 )
 @pytest.mark.parametrize("actuators", [{"hardware": {"torque_limit": 0.01}}, {"wheels": {"torque_limit": 0.01}}])
-def test_an_inertia_in_another_unit_contradicts_the_torque_limit(factor, said, actuators):
+def test_an_inertia_in_another_unit_causes_a_warning_about_the_torque_limit(factor, said, actuators):
     tables = {"spacecraft": {"inertia": [0.5 * factor] * 3}, "controller": {"t_f": 60.0}, "loop": {"mode": "sampled"}}
     found = [one for one in plausibility.warnings(scenario.from_tables({**tables, **actuators})) if "kg cm^2" in one]
     assert [said in one for one in found] == ([] if said is None else [True])
@@ -472,7 +474,7 @@ def test_a_required_torque_beyond_the_actuators_causes_a_warning(metric, key, ra
 
 
 @pytest.mark.parametrize(("limit", "said"), [(2.0, False), (3.0, True)])
-def test_a_required_input_of_another_plant_beyond_its_limit_causes_a_warning(limit, said):
+def test_a_required_input_of_a_chain_beyond_its_limit_causes_a_warning(limit, said):
     tables = {"plant": {"kind": "chain"}, "hardware": {"torque_limit": 2.0}, "requirements": {"peak_torque": limit}}
     found = plausibility.warnings(scenario.from_tables(tables))
     assert [one.startswith("requirements.peak_torque is 3, but") for one in found] == [True] * said
@@ -582,7 +584,7 @@ def test_a_surface_rate_without_a_stable_k1_causes_a_warning(changes, said):
 
 
 @pytest.mark.parametrize("damping", [0.1, 0.03, 0.003])  # p t_f / 3.5 is 1.6, 0.48 and 0.048
-def test_bounds_extend_to_slow_gains_if_a_mode_needs_them(damping):
+def test_default_bounds_extend_to_slow_gains_if_a_flexible_mode_needs_them(damping):
     """A late mode limits the pole of the hold phase to p = z w / (2 k), k the inertia of mode over hub."""
     base = {
         "spacecraft": {"inertia": [100.0, 100.0, 100.0]},

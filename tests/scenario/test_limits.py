@@ -35,7 +35,7 @@ SAMPLED = {"mode": "sampled"}
         ("effort", 2, 2.0),
     ],
 )
-def test_a_limit_can_be_text_with_a_unit(metric, said, value):
+def test_a_required_limit_can_be_text_with_a_unit(metric, said, value):
     read = scenario.from_tables({"requirements": {metric: said}})
     assert read.requirements == {metric: pytest.approx(value, rel=1e-15)}
     share = scenario.from_tables({"requirements": {metric: {"limit": said, "quantile": 0.9}}}).requirements[metric]
@@ -44,7 +44,7 @@ def test_a_limit_can_be_text_with_a_unit(metric, said, value):
     assert scenario.from_tables(parsing.dump(read)) == read
 
 
-def test_every_metric_unit_of_a_spacecraft_accepts_text():
+def test_every_unit_of_a_metric_has_an_example_for_error_messages():
     assert {entry.unit for entry in catalogues.CATALOGUE.values()} - {"-"} <= set(units.EXAMPLES)
 
 
@@ -93,7 +93,7 @@ def test_every_unit_of_a_key_has_an_example_for_error_messages():
         ("2 msec", "s", 2e-3),
     ],
 )
-def test_units_are_products_of_symbols_with_prefixes(text, unit, value):
+def test_units_in_texts_can_be_products_of_symbols_with_prefixes(text, unit, value):
     assert units.to_number(text, unit) == pytest.approx(value, rel=1e-15)
 
 
@@ -105,7 +105,7 @@ def test_units_are_products_of_symbols_with_prefixes(text, unit, value):
         ("1 s^--1", "1/s"), ("1 s^", "s"), ("1 s-²", "1/s^2"),
     ],
 )  # fmt: skip
-def test_other_units_are_refused(text, unit):
+def test_texts_with_an_unknown_or_incompatible_unit_are_refused(text, unit):
     with pytest.raises(ValueError, match="could not convert"):
         units.to_number(text, unit)
 

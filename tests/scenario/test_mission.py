@@ -90,7 +90,7 @@ def sampled(**tables: Any) -> Any:
     return scenario.from_tables({**base, **tables})
 
 
-def test_dead_time_limits_the_bandwidth():
+def test_dead_time_limits_the_bandwidth_of_the_default_gains():
     """Without noise p T = 0.25, where T is the sum of hold, delay and lag."""
     for hardware, dead in (({}, 0.125), ({"delay": 2}, 0.625), ({"delay": 1, "torque_lag": 0.3}, 0.675)):
         said = sampled(hardware=hardware) if hardware else sampled()
@@ -116,7 +116,7 @@ def test_the_designed_loop_has_the_documented_stability_margins():
     assert np.min(down[down > 0.0]) == pytest.approx(7.2, abs=0.3)
 
 
-def test_noise_and_the_torque_limit_limit_the_bandwidth():
+def test_noise_and_torque_limit_bound_the_bandwidth_of_the_default_gains():
     """Five sigma of the torque noise J (2 p + l / J) sigma_w, with l = J p / 2, are half of the limit."""
     limit, sigma = 0.1, 1e-4
     said = sampled(hardware={"rate_noise": sigma, "torque_limit": limit})
@@ -125,7 +125,7 @@ def test_noise_and_the_torque_limit_limit_the_bandwidth():
     assert "bandwidth set by the torque limit" in str(mission.describe_default_gains(said))
 
 
-def test_late_modes_limit_the_bandwidth_and_early_ones_do_not():
+def test_late_modes_limit_the_bandwidth_of_the_default_gains_and_early_ones_do_not():
     """A mode is late if its frequency times the dead time, 0.125 s, exceeds 60 deg."""
     modes = {"damping": [0.002], "coupling": [[0.0, 2.0, 0.0]]}
     early, late = (sampled(flexible={"frequency": [w], **modes}) for w in (4.0, 12.0))
@@ -146,7 +146,7 @@ def test_default_gains_are_described_only_if_the_file_states_no_gain():
         assert "bandwidth" not in str(mission.describe_default_gains(published))
 
 
-def test_a_weak_actuator_reduces_eta():
+def test_a_weak_actuator_reduces_the_default_eta():
     """From rest the first torque is 2 eta^2 J tan(angle / 2) / t_f^2. The smallest default of eta is 2.4."""
     start = {"dispersion": {"attitude": {"kind": "axis_angle", "min_deg": 60.0, "max_deg": 60.0}}}
     needed = 2.0 * 60.0 * math.tan(math.radians(30.0)) / 100.0**2

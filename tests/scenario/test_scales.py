@@ -22,10 +22,12 @@ ARM = {"plant": {"kind": "system", "system": second_order.system(
 
 
 def noise_of_s(known):
+    """Return the predicted noise of s, 1 sigma, in a scenario."""
     return known.devices.noise_of_s(known)
 
 
 def flight(**changes):
+    """Return the scenario first_flight.toml with changes and without its table [tune]."""
     return scenario.replace(scenario.read(FIRST_FLIGHT), tune=None, **changes)
 
 
@@ -40,7 +42,7 @@ def test_the_deadbeat_gain_leaves_the_documented_fraction_of_the_slowest_error(i
 
 
 def growth(c, k, late, keep=0.6, period=1.0):
-    """Return the growth per period of one axis under the sampled law in the hold phase.
+    """Return the logarithm of the growth per period of one axis under the sampled law in the hold phase.
 
     The loop has a delay of whole periods and the digital observer.
     """

@@ -161,12 +161,13 @@ ROUNDING = 1e-14
 
 
 def attitude_of(scenario, table):
+    """Return the quaternion of the attitude in the table "initial" or "reference"."""
     return quaternion(getattr(scenario, table), table)
 
 
 @pytest.mark.parametrize("table", ["initial", "reference"])
 @pytest.mark.parametrize(("said", "expected"), BY_HAND, ids=[str(said) for said, _ in BY_HAND])
-def test_attitudes_by_hand(table, said, expected):
+def test_attitude_keys_give_the_quaternions_computed_by_hand(table, said, expected):
     scenario = from_tables({table: said})
     np.testing.assert_allclose(attitude_of(scenario, table), expected, atol=ROUNDING)
     parts = study(scenario).parts
@@ -203,6 +204,7 @@ def test_every_attitude_key_gives_the_same_attitude(seed):
 
 
 def plain(value):
+    """Return an array as a list."""
     return np.asarray(value).tolist()
 
 
@@ -301,7 +303,7 @@ def test_every_key_sets_a_field_of_its_part():
     assert [(r.metric, r.limit) for r in ready.requirements] == [("effort", 6.0), ("peak_torque", 0.5)]
 
 
-def test_kinds_choose_parts():
+def test_kinds_in_a_scenario_choose_the_parts_of_a_run():
     def parts_of(text):
         return study(from_tables(tomllib.loads(text))).parts
 
@@ -318,7 +320,7 @@ def test_kinds_choose_parts():
     assert (float(one.attitude_noise), float(one.rate_noise)) == (0.0, 1e-6)
 
 
-def test_kinds_of_dispersion():
+def test_kind_of_an_attitude_dispersion_sets_its_distribution():
     def drawn(text) -> Any:
         return study(from_tables(tomllib.loads(text))).dispersion.numbers.get("initial_attitude")
 
@@ -331,6 +333,7 @@ def test_kinds_of_dispersion():
 
 @pytest.mark.parametrize("mode", ["anchored", "flight"])
 def test_the_clock_covers_the_reach_of_the_gains(mode):
+    """The reach is the range of t_f, delta and period in a search. Every run within it has samples until t_end."""
     scenario = from_tables(tomllib.loads(SAMPLED + f"loop.clock = '{mode}'"))
     parts = study(scenario, reach=reach_of(scenario, t_f=35.0)).parts
     for t_f, delta in ((30.0, 0.05), (30.0, 4.0)):
@@ -352,12 +355,14 @@ def test_the_clock_covers_the_reach_of_the_gains(mode):
     ids=str,
 )
 def test_a_reach_with_an_impossible_range_is_refused(farther, refused):
+    """The reach is the range of t_f, delta and period in a search."""
     with pytest.raises(ValueError, match=f"^{re.escape(refused)}$"):
         reach_of(from_tables({"loop": {"mode": "sampled"}}), **farther)
 
 
 @pytest.mark.parametrize("mode", ["anchored", "flight"])
 def test_periods_within_a_reach_share_a_structure_and_each_has_samples_to_the_end(mode):
+    """The reach is the range of the period in a map. With one structure, all periods share a compiled program."""
     found = []
     for period in (0.02, 0.05, 0.2):
         scenario = from_tables(
@@ -373,7 +378,7 @@ def test_periods_within_a_reach_share_a_structure_and_each_has_samples_to_the_en
     assert found[0] == found[1] == found[2]
 
 
-def test_steps_are_bounded_for_the_longest_run_of_a_search():
+def test_the_longest_run_of_a_search_must_not_have_too_many_steps():
     loop = {"mode": "sampled", "period": 0.5, "t_end": 60_010.0, "window": 1.0}
     scenario = from_tables({"loop": loop, "controller": {"t_f": 6e4, "delta": 1.0}})
     reach = reach_of(scenario, t_f=12e4)

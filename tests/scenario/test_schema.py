@@ -112,6 +112,7 @@ BUILT_IN = [(name, tables) for name, tables in COMPLETE if "code" not in str(tab
 
 
 def leaves(tables, path=()):
+    """Yield the path and the value of every number and text in nested tables."""
     if isinstance(tables, dict | list):
         for key, value in tables.items() if isinstance(tables, dict) else enumerate(tables):
             yield from leaves(value, (*path, key))
@@ -120,6 +121,7 @@ def leaves(tables, path=()):
 
 
 def value_at(tables, path):
+    """Return the value at a path in nested tables."""
     for key in path:
         tables = tables[key]
     return tables
@@ -149,6 +151,7 @@ def at_each(wanted, scenarios=BUILT_IN):
 
 
 def refusal(tables):
+    """Return the error message of an invalid scenario, or fail if it is accepted."""
     try:
         from_tables(tables)
     except ScenarioError as error:
@@ -212,12 +215,12 @@ NAMES = [name for name in Scenario.__struct_fields__ if name != "defaulted"]
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_misspelt_table_names_the_nearest(name):
+def test_error_for_a_misspelt_table_names_the_nearest_table(name):
     misspelt = name.replace(name[2], "", 1)
     assert refusal({misspelt: {}}) == f"[{misspelt}] is not a known table; the nearest known one is [{name}]"
 
 
-def test_misspelt_key_names_the_nearest():
+def test_error_for_a_misspelt_key_names_the_nearest_key():
     for tables, path in at_each(lambda path, _: all(isinstance(part, str) for part in path)):
         *table, key = path
         said = refusal(changed(tables, [*table, f"{key}_"], 1.0))
@@ -266,7 +269,7 @@ def test_dump_omits_none_and_keeps_zero():
     ],
     ids=["unclosed", "twice", "null", "binary", "digits", "directory"],
 )
-def test_a_file_that_cannot_be_read_is_named(tmp_path, content, said):
+def test_error_for_an_unreadable_scenario_file_names_the_file(tmp_path, content, said):
     path = tmp_path / "some.toml"
     path.mkdir() if content is None else path.write_bytes(content)
     with refuses(ScenarioError, f"the scenario file {path} {said}"):
@@ -289,7 +292,7 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path, content, said):
         (f'mode = {100_000 * "a "}"', "mode = a a a"),  # in a time that is not quadratic in the length
     ],
 )
-def test_an_error_of_the_parser_quotes_the_line(tmp_path, content, quoted):
+def test_error_for_invalid_toml_quotes_the_line(tmp_path, content, quoted):
     path = tmp_path / "some.toml"
     path.write_text(content)
     with pytest.raises(ScenarioError) as caught:
@@ -298,7 +301,7 @@ def test_an_error_of_the_parser_quotes_the_line(tmp_path, content, quoted):
     assert ("needs quotes" in str(caught.value)) == ("needs quotes" in quoted)
 
 
-def test_a_file_that_is_not_there_is_named(tmp_path):
+def test_error_for_an_absent_scenario_file_names_the_file(tmp_path):
     with pytest.raises(ScenarioError) as caught:
         parsing.load(tmp_path / "none.toml")
     assert str(caught.value) == f"the scenario file {tmp_path / 'none.toml'} does not exist"
@@ -316,12 +319,12 @@ PACKAGED = [*(ROOT / "scenarios").glob("*.toml"), *(ROOT / "benchmarks" / "satel
 
 
 @pytest.mark.parametrize("path", sorted(PACKAGED), ids=lambda path: path.stem)
-def test_packaged_scenarios_are_valid(path):
+def test_scenarios_of_the_repository_are_valid_by_the_json_schema(path):
     jsonschema.Draft202012Validator.check_schema(json_schema())
     VALIDATOR.validate(tomllib.loads(path.read_text()))
 
 
-def test_numbers_of_lists_and_matrices_can_be_texts_with_a_unit():
+def test_json_schema_accepts_texts_with_a_unit_in_lists_and_matrices():
     for inertia in (["300 kg cm^2", 0.02, 0.04], [["300 kg cm^2", 0, 0], [0, 0.02, 0], [0, 0, 0.04]]):
         VALIDATOR.validate({"spacecraft": {"inertia": inertia}})
     VALIDATOR.validate({"flexible": {"coupling": [["0.8 sqrt(kg) m", 0, 0]]}})
@@ -329,7 +332,7 @@ def test_numbers_of_lists_and_matrices_can_be_texts_with_a_unit():
         assert not VALIDATOR.is_valid({table: {key: value}})
 
 
-def test_the_schema_has_every_key_and_no_other():
+def test_json_schema_has_every_key_and_no_other():
     for _, tables in BUILT_IN:
         VALIDATOR.validate(tables)
         for path, _ in leaves(tables) if "code" not in str(tables) else ():  # a custom part may have any key
@@ -353,5 +356,5 @@ def test_the_schema_has_every_key_and_no_other():
         {"requirements": {"peak_torque": {"quantile": 0.9}}},
     ],
 )
-def test_values_out_of_range_and_tables_of_other_plants_are_invalid(tables):
+def test_json_schema_refuses_values_out_of_range_and_tables_of_other_plants(tables):
     assert not VALIDATOR.is_valid(tables)

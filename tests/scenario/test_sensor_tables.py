@@ -24,6 +24,7 @@ LOOP = {"mode": "sampled", "period": 0.1}
 
 
 def read(*sensors, **tables):
+    """Return the scenario with these tables [[sensors]]."""
     return scenario.from_tables({"loop": LOOP, "sensors": list(sensors), **tables})
 
 
@@ -50,7 +51,7 @@ def test_the_built_sensors_have_the_numbers_of_the_tables():
 
 
 @pytest.mark.parametrize("boresight", [[0.0, 0.0, -2.0], [0.0, 0.0, 3.0], [1e-9, 0.0, -1.0]])
-def test_every_boresight_has_a_mounting(boresight):
+def test_a_star_tracker_can_have_any_boresight(boresight):
     suite = scenario.study(read({**TRACKER, "boresight": boresight}, GYRO)).parts.sensors
     np.testing.assert_allclose(suite.sensors[0].axes()[2], np.array(boresight) / np.linalg.norm(boresight), atol=1e-8)
     np.testing.assert_allclose(suite.sensors[0].axes() @ suite.sensors[0].axes().T, np.eye(3), atol=1e-14)
@@ -77,7 +78,7 @@ def test_the_json_schema_accepts_sensor_tables():
     assert not valid({"loop": LOOP, "sensors": [{**TRACKER, "noise_across": -1.0}, GYRO]})
 
 
-def test_defaults_follow_from_an_equivalent_star_tracker():
+def test_defaults_with_two_star_trackers_equal_those_of_one_equivalent_star_tracker():
     """Two equal star trackers are equivalent to one in [hardware] with the noise over sqrt(2)."""
     noise = 2e-5
     tracker = {"kind": "star_tracker", "noise_across": noise, "latency": 0.1}
@@ -97,14 +98,16 @@ class Level(ptsmc.AttitudeSensor):
     scale: float = ptsmc.number(1.0, above=0.0, meaning="of its reading", unit="-")
 
     def read(self, q):
-        """Return (1,) [-]."""
+        """Return the x component [-] of the sensor's z axis in inertial axes, times `scale`, as an array (1,)."""
         return self.scale * attitude.rotate(q, self.direction())[:1]
 
     def direction(self):
+        """Return the sensor's z axis in body axes."""
         return attitude.rotate(self.mounting, jnp.array([0.0, 0.0, 1.0]))
 
 
 def with_custom_sensor(**keys):
+    """Return a scenario with a star tracker, a gyro and a custom sensor with these keys."""
     table = {"kind": "custom", "code": f"{__file__}:Level", "noise": [1e-3], **keys}
     return scenario.reading.complete(read(TRACKER, table, GYRO))
 
