@@ -35,7 +35,7 @@ def test_probability_of_a_met_verdict_agrees_with_bayes_rule_on_a_grid(requireme
 
 
 @pytest.mark.parametrize("requirement", [SHOWN, SEEN, replace(SHOWN, quantile=0.9973, confidence=0.9)])
-def test_allowed_is_the_largest_count_with_a_sure_verdict(requirement):
+def test_allowed_violations_are_the_most_with_a_sure_verdict_on_held_out_trials(requirement):
     held_out = confirm.held_out_trials([requirement])
     trials = max(confirm.FEWEST_TRIALS, confirm.FEWEST_RATIO * held_out)
     most = confirm.allowed_violations(requirement, held_out, trials)
@@ -86,7 +86,10 @@ def test_a_band_contains_the_trials_ranked_around_the_last_that_may_break_the_li
 
 
 def test_a_band_replaces_the_training_trials_in_a_quantile_limit():
-    """All but the two worst trials of the band must keep the limit. Single training trials need not keep it."""
+    """The band has the confirmation trials closest to the limit. All but its two worst trials must keep the limit.
+
+    Single training trials need not keep it.
+    """
     wanted = [replace(SHOWN, metric="peak_torque", limit=0.7), Requirement("effort", 5.0)]
     some = problem(peak_torque=0.7)
     banded = objective.problem(

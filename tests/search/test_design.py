@@ -24,6 +24,7 @@ CASE = {
 
 
 def largest(tables, t_f, trials):
+    """Return the largest peak torque [N m] of trials with this t_f [s]."""
     tables = {
         **tables,
         "controller": {**tables["controller"], "t_f": t_f},
@@ -34,7 +35,7 @@ def largest(tables, t_f, trials):
 
 
 @pytest.mark.long
-def test_shortest_time_is_the_crossing_of_the_limit_in_simulations():
+def test_shortest_t_f_just_keeps_the_torque_limit_in_simulated_trials():
     limit, trials = 0.6, 32
     found = design.shortest_time(scenario.from_tables(CASE), Requirement("peak_torque", limit), 4, np.arange(trials))
     assert found.theory is not None
@@ -53,7 +54,7 @@ RULES = {"chain": 14.0, "spacecraft": 2 * 14.0 * np.tan(np.pi / 4)}  # peak torq
 
 
 @pytest.mark.parametrize("plant", PLANTS)
-def test_shortest_time_from_rest_agrees_with_rule_3_5(plant):
+def test_shortest_t_f_from_rest_agrees_with_rule_3_5(plant):
     """Rule 3.5 has a closed form from rest. Without a disturbance, the search agrees with it."""
     tables = {
         **STARTS[plant],
@@ -67,7 +68,7 @@ def test_shortest_time_from_rest_agrees_with_rule_3_5(plant):
 
 
 @pytest.mark.parametrize("plant", PLANTS)
-def test_a_limit_below_the_disturbance_cannot_be_kept(plant):
+def test_a_torque_limit_below_the_disturbance_has_no_shortest_t_f(plant):
     tables = {} if plant == "spacecraft" else STARTS[plant]
     found = design.shortest_time(scenario.from_tables(tables), Requirement("peak_torque", 0.009), 0, np.arange(1))
     assert (found.theory, found.simulated) == (None, None)
@@ -75,7 +76,7 @@ def test_a_limit_below_the_disturbance_cannot_be_kept(plant):
 
 # `make test-long` also builds a new scenario with this t_f; a test below checks that only t_f changes
 @pytest.mark.parametrize("posed_anew", short([False, True], [False]))
-def test_shortest_time_of_a_chain(posed_anew):
+def test_shortest_t_f_of_a_chain_keeps_the_limit_and_agrees_with_theory(posed_anew):
     chain = scenario.from_tables({"plant": {"kind": "chain", "order": 3}})
     found = design.shortest_time(chain, Requirement("peak_torque", 5.0), 0, np.arange(1))
     assert found.theory is not None
@@ -96,7 +97,7 @@ OBSERVED = {
 
 
 @pytest.mark.parametrize("fails_until", [None, 4.5])
-def test_t_f_ends_after_the_observer_time_for_any_torque_limit(fails_until, monkeypatch):
+def test_shortest_t_f_exceeds_the_convergence_time_of_the_observer(fails_until, monkeypatch):
     """The observer converges in 4 s, so the search begins at 1.05 times 4 s and has a tolerance of 1e-3.
 
     A failed run breaks every limit, even if its torque is small.
@@ -117,7 +118,7 @@ def test_t_f_ends_after_the_observer_time_for_any_torque_limit(fails_until, monk
 
 
 @pytest.mark.parametrize(("confidence", "least"), [(None, 6), (0.5, 7)])
-def test_a_quantile_limit_is_kept_by_that_fraction_of_the_trials(confidence, least):
+def test_shortest_t_f_for_a_quantile_limit_keeps_it_in_that_fraction_of_the_trials(confidence, least):
     """It is not necessary that all trials keep the limit."""
     tables = {
         "plant": {"kind": "chain", "order": 2, "x0": [1.0, 0.0]},
@@ -143,7 +144,7 @@ def test_a_quantile_limit_is_kept_by_that_fraction_of_the_trials(confidence, lea
 
 
 @pytest.mark.parametrize("power", [1.0, 2.0, 3.0])
-def test_search_finds_the_last_crossing(power):
+def test_search_for_the_shortest_t_f_finds_the_last_crossing_of_the_limit(power):
     found = design._shortest_t_f(lambda t: t**-power + 0.02 * np.sin(t), 0.1, 3.0, 1e-3, 1e3, 1e-4, 60)
     assert found is not None
     assert found**-power + 0.02 * np.sin(found) <= 0.1
@@ -155,8 +156,8 @@ def test_search_finds_the_last_crossing(power):
     )
 
 
-def test_the_bracket_is_halved_if_peaks_hardly_decrease_with_t_f():
-    """Steps after the rule 1 / t^2 are tiny in this case, from both sides."""
+def test_search_for_the_shortest_t_f_converges_if_peaks_hardly_decrease_with_t_f():
+    """It halves its bracket, because steps after the rule 1 / t^2 are tiny in this case, from both sides."""
     for start in (60.0, 10.0):
         found = design._shortest_t_f(lambda t: 1.0 + 1e-6 * (30.0 - t), 1.0, start, 1.0, 100.0, 1e-3, 60)
         assert found == pytest.approx(30.0, rel=1e-3)

@@ -83,7 +83,7 @@ def test_f_is_the_logarithm_of_the_statistic_of_the_averaged_trials(statistic, t
     np.testing.assert_allclose(np.exp([f, value]), expected(values[:8]), rtol=1e-12)
 
 
-def test_goal_limits_minimises_the_largest_metric_over_its_limit():
+def test_objective_limits_is_the_largest_ratio_of_a_metric_to_its_limit():
     """A trial that fails does not count in F, and its c stays that of a failure."""
     limits, status = np.array([0.5, 8.0]), np.array([rollout.OK, rollout.OK, rollout.DIVERGED])
     limited = np.array([[0.3, 5.0], [0.4, 7.0], [2.0, 90.0]])
@@ -103,7 +103,7 @@ def test_goal_limits_minimises_the_largest_metric_over_its_limit():
     assert np.all(c[:, 2] == FAILED - 1.0)
 
 
-def test_goal_limits_includes_the_margins(monkeypatch):
+def test_objective_limits_includes_the_margins(monkeypatch):
     """F and its gradient follow the largest row: a metric's at the first point, a margin's at the second point."""
     simulated = {"c": np.array([[[0.3, -0.2]], [[-0.5, -0.4]]]), "c_gradient": np.arange(8.0).reshape(2, 1, 2, 2)}
     of_loop = {"c": np.array([[[-0.1]], [[0.6]]]), "c_gradient": 10.0 + np.arange(4.0).reshape(2, 1, 1, 2)}

@@ -13,7 +13,7 @@ from tuning.search.local_searches import LocalSearches
 from tuning.search.normalisation import Bounds
 
 
-class Valley(Evaluator):
+class Quadratic(Evaluator):
     """F = x'A x subject to a'x >= b, with x the normalised gains less 0.5.
 
     F is NaN if the first element of x exceeds `wall`. If it is below `lost`, a trial fails that does not count in F.
@@ -35,14 +35,15 @@ class Valley(Evaluator):
         return Measurement(normalised, f, violation[:, None, None], f)
 
 
-def refined(valley, start, seed=3, size=evolution.WHOLE_BOX):
-    names = valley.bounds.names
+def refined(evaluator, start, seed=3, size=evolution.WHOLE_BOX):
+    """Run differential evolution from a point x; return the best point and the calls of the progress report."""
+    names = evaluator.bounds.names
     some = objective.problem(parts(20.0, 3.0, 1.0), TURNED, 0, np.arange(1), names, [Requirement("peak_torque", 1.0)])
     normalised = 0.5 + np.asarray(start)
     best, told = Best(normalised, 1, 0.0), []
-    best.offer(normalised[None], valley.measure(some, normalised[None]))
+    best.offer(normalised[None], evaluator.measure(some, normalised[None]))
     path = []
-    evolution.evolve(valley, some, best, normalised, seed, lambda *at: told.append(at), path.append, size)
+    evolution.evolve(evaluator, some, best, normalised, seed, lambda *at: told.append(at), path.append, size)
     assert len(path) == len(told)
     return best, told
 
@@ -54,8 +55,8 @@ def ill_conditioned(count):
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_minimum_of_an_ill_conditioned_rotated_quadratic_with_a_wall_is_found(seed):
-    best, told = refined(Valley(ill_conditioned(3), wall=0.2), [-0.35, 0.3, -0.3], seed)
+def test_minimum_of_an_ill_conditioned_quadratic_is_found_despite_undefined_values(seed):
+    best, told = refined(Quadratic(ill_conditioned(3), wall=0.2), [-0.35, 0.3, -0.3], seed)
     # the search ends if `PATIENCE` generations reduce F by less than `LEAST_DECREASE`, so a few times that can remain
     assert best.f < 5.0 * evolution.LEAST_DECREASE
     assert np.isfinite(best.f)
@@ -67,19 +68,19 @@ def test_constrained_optimum_on_an_active_limit_is_found(seed):
     matrix, along, least = ill_conditioned(3), np.array([1.0, 0.5, -0.4]), 0.2
     inverse = along @ np.linalg.solve(matrix, along)
     optimum = least**2 / inverse  # at x = A^-1 a b / (a' A^-1 a)
-    best, _ = refined(Valley(matrix, along, least), [0.35, 0.3, -0.3], seed)
+    best, _ = refined(Quadratic(matrix, along, least), [0.35, 0.3, -0.3], seed)
     assert best.violation == 0.0
     assert optimum - 2.0 * (2.0 * least / inverse) * 1e-4 <= best.f  # points may exceed the limit by SLACK
     assert best.f <= optimum + 5.0 * evolution.LEAST_DECREASE
 
 
-def test_the_first_point_of_the_history_is_the_best_of_the_sweep():
+def test_the_first_point_of_the_history_is_the_best_of_the_sobol_points():
     """It is the only result if the search is interrupted then."""
-    valley = Valley(np.eye(2))
-    names = valley.bounds.names
-    valley.bounds = Bounds(names, (1.0, 1.0), (2.0, 2.0))
+    evaluator = Quadratic(np.eye(2))
+    names = evaluator.bounds.names
+    evaluator.bounds = Bounds(names, (1.0, 1.0), (2.0, 2.0))
     some = objective.problem(parts(20.0, 3.0, 1.0), TURNED, 0, np.arange(1), names, [Requirement("peak_torque", 1.0)])
-    search = LocalSearches(valley, 0.0, 4, np.random.default_rng(0))
+    search = LocalSearches(evaluator, 0.0, 4, np.random.default_rng(0))
     search.measure_sobol_points(some, np.full(2, 1.9))
     (first,) = search.history
     assert first.value == search.best.value
@@ -89,26 +90,26 @@ def test_the_first_point_of_the_history_is_the_best_of_the_sweep():
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_gains_with_a_failed_trial_are_not_accepted(seed):
     """F decreases towards points with a failed trial that does not count in F."""
-    best, _ = refined(Valley(np.eye(2), lost=0.2), [0.4, 0.1], seed)
+    best, _ = refined(Quadratic(np.eye(2), lost=0.2), [0.4, 0.1], seed)
     assert not best.failed
     assert 0.2**2 <= best.f <= 0.2**2 + 5.0 * evolution.LEAST_DECREASE
 
 
 def test_a_single_gain_is_optimised():
-    best, _ = refined(Valley(np.array([[4.0]])), [0.4])
+    best, _ = refined(Quadratic(np.array([[4.0]])), [0.4])
     assert best.f < 1e-6
 
 
 def test_search_ends_early_without_progress():
-    _, told = refined(Valley(np.zeros((2, 2))), [0.1, 0.1])
+    _, told = refined(Quadratic(np.zeros((2, 2))), [0.1, 0.1])
     assert len(told) <= evolution.PATIENCE + 1
 
 
 @pytest.mark.parametrize("size", [evolution.NEAR_BEST, evolution.WHOLE_BOX])
 def test_first_generation_is_around_the_starting_point_or_in_the_whole_box(size):
-    valley = Valley(np.eye(2))
-    refined(valley, [0.1, -0.2], size=size)
-    first = valley.seen[1]  # after the starting point itself
+    evaluator = Quadratic(np.eye(2))
+    refined(evaluator, [0.1, -0.2], size=size)
+    first = evaluator.seen[1]  # after the starting point itself
     assert first.shape == (size[0], 2)
     np.testing.assert_allclose(first[0], [0.1, -0.2])
     if size is evolution.NEAR_BEST:
@@ -119,13 +120,13 @@ def test_first_generation_is_around_the_starting_point_or_in_the_whole_box(size)
 
 
 def test_search_approaches_a_limit_that_no_point_can_keep():
-    best, told = refined(Valley(np.eye(2), np.array([1.0, 1.0]), least=3.0), [-0.3, -0.3])
+    best, told = refined(Quadratic(np.eye(2), np.array([1.0, 1.0]), least=3.0), [-0.3, -0.3])
     assert len(told) == evolution.GENERATIONS
     assert best.violation < 2.01  # x is 0.5 at most
 
 
 def test_the_starting_point_remains_if_all_points_fail():
-    best, _ = refined(Valley(np.eye(2), wall=-1.0), [0.1, 0.2])
+    best, _ = refined(Quadratic(np.eye(2), wall=-1.0), [0.1, 0.2])
     assert not np.isfinite(best.f)
     np.testing.assert_allclose(best.normalised, [0.6, 0.7])
 

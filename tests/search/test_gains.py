@@ -78,7 +78,7 @@ def test_gains_set_in_parts_equal_gains_set_in_the_scenario(name):
         np.testing.assert_allclose(known[gain], value, rtol=1e-12)
 
 
-def test_time_after_t_f_is_unchanged():
+def test_setting_t_f_keeps_the_time_from_t_f_to_t_end():
     scenario, ready = wide()
     changed = gains.in_scenario(scenario, {"t_f": 11.0})
     assert changed.loop.t_end == 13.0
@@ -189,11 +189,13 @@ SAMPLED = {"mode": "sampled"}
 
 
 def filtered(interval):
+    """Return a scenario with an attitude filter and this period of the star tracker [s]."""
     hardware = {"attitude_noise": 2e-5, "rate_noise": 1e-6, "star_tracker_period": interval}
     return {"loop": {**SAMPLED, "period": 0.1}, "hardware": hardware, "filter": {"bandwidth": 0.5}}
 
 
 def timed(t_f, **gains):
+    """Return a scenario with this t_f [s] and these gains of the law."""
     return {"controller": {"t_f": t_f, **gains}}
 
 
@@ -242,7 +244,7 @@ DEFAULT_BOUNDS = {
 
 
 @pytest.mark.parametrize("name", DEFAULT_BOUNDS)
-def test_default_bounds(name):
+def test_default_bounds_of_a_gain_follow_from_t_f_and_the_gain_of_the_scenario(name):
     for tables, expected in DEFAULT_BOUNDS[name]:
         made = from_tables({**tables, "tune": {"free": [name]}})
         np.testing.assert_allclose(made.search.bounds[name], expected, rtol=1e-12, err_msg=str(tables))
@@ -394,6 +396,7 @@ class Shared(prescribed_time.PrescribedTime):
 
 
 def shared(parts):
+    """Return the parts with a law of the class `Shared`."""
     law = parts.controller
     return replace(parts, controller=Shared(**{f.name: getattr(law, f.name) for f in fields(law)}))
 
@@ -418,7 +421,7 @@ def test_column_of_the_published_gains_is_named_after_their_source():
 
 
 @pytest.mark.parametrize("kind", ["chain", "spacecraft"])
-def test_the_papers_law_replaces_another_on_every_plant(kind):
+def test_published_scenario_has_the_papers_law_on_every_plant(kind):
     order = {"order": 2} if kind == "chain" else {}
     simulated = scenario.from_tables(
         {"plant": {"kind": kind, **order}, "loop": {"mode": "sampled"}, "controller": {"kind": "pd", "t_f": 12.0}}

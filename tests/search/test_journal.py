@@ -53,7 +53,7 @@ def test_a_damaged_record_and_all_later_records_are_computed_again(tmp_path, at)
     assert asked == [1, 2]
 
 
-def test_another_question_replaces_all_later_records(tmp_path):
+def test_another_question_replaces_all_later_records_of_the_journal(tmp_path):
     ask(Journal(tmp_path / "j"), 4, [])
     journal, asked = Journal(tmp_path / "j"), []
     journal.get(b"question 0", dict)
@@ -66,7 +66,7 @@ def test_another_question_replaces_all_later_records(tmp_path):
     assert replayed.get(b"question 2", dict) == {}  # no earlier record is left
 
 
-def test_reading_does_not_change_the_file(tmp_path):
+def test_reading_a_journal_does_not_change_its_file(tmp_path):
     """An incomplete record of a killed process is removed only when the next evaluation is recorded."""
     ask(Journal(tmp_path / "j"), 3, [])
     data = (tmp_path / "j").read_bytes()

@@ -13,10 +13,11 @@ from tuning.search import hand_overs, local_search, local_searches, normalisatio
 from tuning.search.evaluate import Evaluator, MeasurementWithGradients
 
 
-class Valley(Evaluator):
+class RosenbrockEvaluator(Evaluator):
     """Rosenbrock function F = (x0 - 0.2)^2 + 100 (x1 - x0^2)^2 without limits. x2 has no effect. Points are counted."""
 
     def _answer(self, problem, normalised, *, with_gradients):
+        """Return F, no limits, and their gradients if requested."""
         x0, x1, _ = normalised.T
         f, c = (x0 - 0.2) ** 2 + 100 * (x1 - x0**2) ** 2, np.full((len(normalised), 0, 8), -1.0)
         slope = np.stack([2 * (x0 - 0.2) - 400 * x0 * (x1 - x0**2), 200 * (x1 - x0**2), 0.0 * x0], axis=1)
@@ -30,7 +31,7 @@ THREE = normalisation.Bounds(("eta", "k1", "sign_width"), (2.05, 0.1, 1e-5), (6.
 def test_a_longer_local_search_continues_a_shorter_one_from_the_same_point():
     ends, counts = [], []
     for parts_of_it in ((7, 30), (30,)):
-        evaluate, start = Valley(THREE), local_search.Start(np.array([0.9, 0.1, 0.5]))
+        evaluate, start = RosenbrockEvaluator(THREE), local_search.Start(np.array([0.9, 0.1, 0.5]))
         best, kept = local_search.Best(start.normalised, 0, 0.0), []
         for steps in parts_of_it:
             kept.clear()
@@ -46,7 +47,7 @@ def test_a_longer_local_search_continues_a_shorter_one_from_the_same_point():
 
 def test_a_local_search_from_the_same_point_of_the_same_problem_simulates_and_records_nothing():
     """With few steps, a search often ends at its starting point, and the next search begins there too."""
-    evaluate, some = Valley(THREE), replace(problem(), names=THREE.names)
+    evaluate, some = RosenbrockEvaluator(THREE), replace(problem(), names=THREE.names)
     run = local_searches.LocalSearches(evaluate, 0.0, 6, np.random.default_rng(0))
     counts = []
     for one in (some, some, replace(some, averaged=7)):
@@ -103,6 +104,7 @@ class Conflicting(Evaluator):
         self.a, self.b, self.third = a, b, third
 
     def measure_with_gradients(self, problem, normalised):
+        """Return F and the three limits with their gradients."""
         (x0, x1), zero = normalised.T, np.zeros(len(normalised))
         y, along = (x1 - 0.3) ** 2, 2.0 * (x1 - 0.3)
         c = np.stack([2.0 * (self.a - x0) + y, x0 - self.b + y, zero + self.third], axis=1)
@@ -172,6 +174,8 @@ class OfDelta(Evaluator):
         self._f_and_c = f_and_c
 
     def measure_with_gradients(self, problem, normalised):
+        """Return F and the c of all trials with their derivatives by the normalised delta."""
+
         def values(share):
             return jnp.stack(self._f_and_c(self.bounds.gains(share)[0]))
 
@@ -206,6 +210,7 @@ def test_another_local_search_is_used_if_the_hand_over_on_a_sample_breaks_a_limi
 
 
 def rippled(delta):
+    """Return a parabola with ripples of period 0.6 s, and the limit c = 1.7 s - delta."""
     return 0.02 * (delta - 1.8) ** 2 + 0.01 * (1.0 - jnp.cos(2.0 * jnp.pi / 0.6 * delta)), 1.7 - delta
 
 
@@ -219,7 +224,7 @@ def test_a_search_finds_the_best_local_minimum_among_ripples_over_delta(delta):
     np.testing.assert_allclose(run.gains, 1.8, rtol=1e-9)
 
 
-def test_prices_are_the_lagrange_multipliers_of_the_limits():
+def test_multipliers_of_the_limits_are_estimated_from_gradients():
     """F = x0 - 2 x1 subject to x1 - x0 / 2 <= 0, on the bound x0 = 0, with a second limit that is inactive."""
     f_gradient, c_gradient = np.array([[1.0, -2.0]]), np.array([[-0.5, 1.0], [3.0, 3.0]])
     c = np.array([[[-0.3, 0.0], [-0.5, -0.2]]])
@@ -254,7 +259,7 @@ def test_only_gains_without_effect_are_reset_to_the_scenarios_values():
     hops = normalisation.Bounds(("observer_gain", *THREE.names[1:]), (2.05, 0.1, 1e-5), (600.0, 50.0, 1e-1), jump=5e-3)
     for bounds, width, kept in ((THREE, 2e-3, True), (THREE, 2e-3, False), (hops, 2e-3, True), (hops, 1e-3, True)):
         some, scenario_gains = replace(problem(), names=bounds.names), np.array([3.0, 5.0, width])
-        run = local_searches.LocalSearches(Valley(bounds), 0.0, 40, np.random.default_rng(0))
+        run = local_searches.LocalSearches(RosenbrockEvaluator(bounds), 0.0, 40, np.random.default_rng(0))
         if kept:
             run.begin(some, scenario_gains, np.zeros((0, 3)))
         run.search_locally(some, {0: np.array([0.9, 0.1, 0.1])})
@@ -271,7 +276,7 @@ def test_starting_points_are_the_best_far_apart_points_and_then_nearer_ones():
     ]  # fmt: skip
 
 
-def test_a_local_search_keeps_its_number_of_points_and_survives_useless_gradients():
+def test_a_local_search_keeps_its_number_of_points_with_wrong_or_nan_gradients():
     """F = ln(1 + |x - a|^2), whose gradient is scaled by 1e30 at the first point and is NaN at the third point."""
 
     class Bowl(Evaluator):

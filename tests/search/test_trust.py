@@ -139,7 +139,7 @@ def test_a_gain_is_flat_if_objective_and_limits_change_by_less_than_one_percent(
     assert trust.Profile(ones, moved, 0.0 * ones, np.log(moved)).is_flat == flat  # no requirements
 
 
-def test_gradients_are_checked_against_finite_differences():
+def test_gradient_error_is_the_deviation_from_finite_differences():
     noisy = moved_in_time()
     # t_f - delta is not a multiple of the period, because the noise of the first period has a kink there
     evaluate, z = Evaluator(BOUNDS), BOUNDS.normalise(np.array([3.3, 1.07, 19.0]))
@@ -156,7 +156,7 @@ def test_gradients_are_checked_against_finite_differences():
     np.testing.assert_allclose(trust.gradient_error(Wrong(BOUNDS), noisy, z), expected, rtol=1e-3)
 
 
-def test_intervals_of_mean_and_rms_agree_with_large_sample_theory():
+def test_confidence_intervals_of_mean_and_rms_agree_with_large_sample_theory():
     values = np.random.default_rng(1).normal(5.0, 1.0, 4000)
     low, high = trust.interval(values) or (0.0, 0.0)
     half = stats.norm.ppf(0.975) * values.std() / np.sqrt(values.size)
@@ -167,7 +167,7 @@ def test_intervals_of_mean_and_rms_agree_with_large_sample_theory():
     np.testing.assert_allclose([low, high], [rms - half, rms + half], atol=0.1 * half)
 
 
-def test_a_ratio_over_the_same_trials_has_a_narrow_interval():
+def test_a_ratio_over_the_same_trials_has_a_narrow_confidence_interval():
     rng = np.random.default_rng(3)
     common = rng.lognormal(0.0, 0.5, 500)
     low, high = trust.ratio_interval(10.0 * common, common * rng.normal(1.0, 0.01, 500)) or (0.0, 0.0)
@@ -175,14 +175,14 @@ def test_a_ratio_over_the_same_trials_has_a_narrow_interval():
     assert high - low < 0.05  # each single RMS has an uncertainty of 5 %
 
 
-def test_equal_or_too_few_values_have_no_interval():
+def test_equal_or_too_few_values_have_no_confidence_interval():
     assert trust.interval(np.full(100, 2.0)) is None
     assert trust.interval(np.arange(7.0)) is None
     assert trust.interval(np.arange(8.0)) is not None
 
 
 @pytest.mark.long
-def test_differential_evolution_finds_the_same_optimum(monkeypatch):
+def test_differential_evolution_finds_the_optimum_of_the_search_with_gradients(monkeypatch):
     monkeypatch.setattr(global_check, "GENERATIONS", 30)
     run = parts(20.0, 3.0, 0.5, period=0.2, noise=(2e-5, 1e-6), t_end=21.0)
     run = replace(run, clock=clock.anchored_clock(0.2, 21.0))
@@ -215,7 +215,7 @@ def test_the_global_check_reports_the_original_limits(monkeypatch, normalised, k
 
 
 @dataclass(frozen=True)
-class Told:
+class OneLimit:
     """A problem with one gain and one requirement, with or without margins."""
 
     limit: float = 1.0
@@ -223,6 +223,7 @@ class Told:
     names, rows = ("eta",), ("peak_torque",)
 
     def tightened(self, factor):
+        """Return the problem with its limit times this factor."""
         return replace(self, limit=self.limit * factor)
 
 
@@ -233,6 +234,7 @@ class Steps:
         self.c, self.rollouts, self.judged = c, 0, 0
 
     def measure(self, problem, normalised):
+        """Return F and c at normalised gains (points, 1)."""
         self.rollouts += len(normalised)
         self.judged += len(normalised) * (problem.margins is not None)
         f = np.where(normalised[:, 0] > 0.9, np.inf, 3.0 + normalised[:, 0])
@@ -251,7 +253,7 @@ def test_the_global_check_uses_the_tightened_limits_of_the_search(monkeypatch):
             np.select([normalised < 0.3, normalised < 0.6], metric[:2], 0.8) / problem.limit - 1.0
         )
     )
-    searched: Any = SimpleNamespace(problem=Told(), margins={"peak_torque": 0.1}, normalised=np.array([0.8]))
+    searched: Any = SimpleNamespace(problem=OneLimit(), margins={"peak_torque": 0.1}, normalised=np.array([0.8]))
     found = global_check.check(evaluate, searched, 1, with_gradients=False)
     assert found.kept
     assert 2.6 <= found.gains["eta"] < 2.6 + 10.0 * global_check.SPREAD  # spread of F in the final population
@@ -270,8 +272,8 @@ def test_the_global_check_computes_margins_only_for_surviving_points(monkeypatch
 
     ends = {}
     for told, c in (
-        (Told(margins="gain_margin"), lazily),
-        (Told(), lambda _, normalised: np.concatenate([0.2 - normalised, 0.6 - normalised], axis=1)),
+        (OneLimit(margins="gain_margin"), lazily),
+        (OneLimit(), lambda _, normalised: np.concatenate([0.2 - normalised, 0.6 - normalised], axis=1)),
     ):
         evaluate: Any = Steps(c)
         searched: Any = SimpleNamespace(problem=told, margins={"peak_torque": 0.1}, normalised=np.array([0.8]))

@@ -475,7 +475,8 @@ def test_a_global_search_follows_if_harder_trials_lead_beyond_a_limit(monkeypatc
         ([(0.0, [4.0, 1.0, 0.0, 0.0]), (0.0, [4.0, 1.0, 0.0, 0.0]), (0.0, [1.0, 1.0, 1.0, 9.0])], [0, 1]),
     ],
 )
-def test_gains_with_the_largest_effect_on_active_limits_are_held_except_for_two(rows, held):
+def test_gains_with_the_largest_effect_on_active_limits_are_decisive_except_for_two(rows, held):
+    """Decisive gains are constant in the choice of starting points. At least two gains stay free."""
     c = np.array([[[violation - 0.5, violation] for violation, _ in rows]])  # the second of two trials has the larger c
     slope = np.array([[[np.full(4, 1e3), np.asarray(by)] for _, by in rows]])
     seen = MeasurementWithGradients(np.zeros((1, 4)), np.zeros(1), c, np.zeros(1), np.zeros((1, 4)), slope)
@@ -519,7 +520,7 @@ def test_a_search_without_gradients_finds_the_same_optimum(monkeypatch):
     np.testing.assert_allclose(found[False].value, found[True].value, rtol=1e-3)
 
 
-def test_statistics_count_failures_and_cover_the_other_trials(monkeypatch):
+def test_statistics_of_a_tuning_count_failed_trials_and_cover_the_others(monkeypatch):
     trials = simulations.simulate_trials(problem().batch_of(np.arange(8)), np.array([3.0, 0.5]))
     lost = np.array([1, 4, 6])
     trials.status[lost] = rollout.SINGULAR

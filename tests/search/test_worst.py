@@ -39,6 +39,7 @@ def posed(dispersion, requirement=None, settling_angle=4.0, **others):
 
 
 def sine(amplitude):
+    """Return a sinusoidal disturbance torque with this amplitude [N m] on each axis."""
     zero = [0.0] * 3
     return disturbances.Sinusoid(*(vector(v) for v in ([amplitude] * 3, [0.1] * 3, zero, zero)))
 
@@ -63,6 +64,7 @@ def test_a_search_computes_only_the_pointing_metrics_that_its_problem_needs():
 
 @pytest.fixture(autouse=True)
 def few_screened(monkeypatch):
+    """Screen 64 trials for the worst case, and simulate 10 trials together."""
     monkeypatch.setattr(worst, "SCREENED", 64)
     monkeypatch.setattr(simulations, "ROW", 10)
 
@@ -139,7 +141,7 @@ def swinging(x0, std, amplitude, settling_angle=1e9, **limits):
     return objective.problem(run, spread, 5, np.arange(8), ("eta", "delta"), wanted), wanted
 
 
-def test_normal_numbers_are_searched_within_a_ball_of_high_probability():
+def test_worst_case_of_normal_dispersions_is_on_a_sphere_of_high_probability():
     from scipy.stats import chi2
 
     problem, wanted = swinging(0.0, [1e-9, 1e-3], 0.0, peak_rate=0.05)
@@ -151,7 +153,7 @@ def test_normal_numbers_are_searched_within_a_ball_of_high_probability():
     np.testing.assert_allclose(found.ratio, 1e-3 * size / 0.05, rtol=1e-8)  # the initial rate is the peak rate
 
 
-def test_normal_numbers_stay_just_inside_their_ball():
+def test_search_for_the_worst_case_keeps_normal_numbers_inside_their_ball():
     """Gradients are cut off at the surface of the ball. Uniform numbers do not change.
 
     With a gradient, the normal numbers move to the point of the sphere in its direction.
@@ -248,8 +250,8 @@ def test_a_limit_keeps_the_default_margin_if_only_others_are_robust_or_were_brok
     np.testing.assert_allclose(problem.tightened(1.0 - kept).limits, problem.limits * (1.0 - kept), rtol=1e-15)
 
 
-def test_given_coordinates_are_simulated_as_random_ones():
-    """A trial that joined with given coordinates has the same constraints as the trial with these coordinates."""
+def test_a_trial_with_given_random_numbers_equals_the_trial_that_draws_them():
+    """The random numbers of a trial are its coordinates. Trials that join a search may have given coordinates."""
     problem, _ = swinging(1.0, [0.2, 0.1], 0.01, peak_rate=0.05)
     more = objective.with_trials(problem, np.asarray([40]))
     drawn_ones = objective.coordinates_of(problem.dispersion, 5, np.asarray([40]))
@@ -266,7 +268,7 @@ def test_given_coordinates_are_simulated_as_random_ones():
     np.testing.assert_allclose(other.c[0, 0, 9:], one.c[0, 0, 0], rtol=1e-12)
 
 
-def test_joining_trials_fill_free_slots_first_and_then_replace_the_oldest():
+def test_hard_trials_that_join_a_search_fill_free_slots_and_then_replace_the_oldest():
     problem, wanted = posed(random_turns(0.4, 2.0))
     evaluate = Evaluator(Bounds(("eta", "delta"), (2.5, 0.3), (6.0, 4.0)))
     search, joined = rounds.Rounds(evaluate, problem, wanted, robust=False), 0
@@ -338,7 +340,7 @@ def test_the_hardest_screened_trial_is_the_worst_case_if_nothing_can_be_moved():
 
 
 @pytest.mark.parametrize("plant", short(["chain", "spacecraft"], ["chain"]))
-def test_a_trial_without_a_metric_is_the_hardest(plant):
+def test_a_trial_without_a_value_of_the_required_metric_is_the_hardest(plant):
     """Trials near the target settle, and trials farther away do not settle before the end."""
     if plant == "spacecraft":
         spread = random_turns(0.01, 2.0)
