@@ -19,22 +19,23 @@ UNEVEN = np.array([0.0, 0.7, 1.0, 2.5, 2.9, 4.0, 7.0, 7.2, 9.0])
 
 
 def wander(times):
-    """Attitudes (n, 4) that turn about a moving axis."""
+    """Return attitudes (n, 4) of a body that turns about a moving axis, at times [s]."""
     return Rotation.from_rotvec(
         np.stack([0.8 * np.sin(0.3 * times), 0.1 * times, np.cos(0.2 * times)], axis=1)
     ).as_quat()
 
 
 def at(reference, times) -> Any:
+    """Return attitude, rate and acceleration of a reference at times [s], as arrays."""
     return jax.tree.map(np.asarray, lapack.vmap(reference)(jnp.asarray(times)))
 
 
 def apart(q, p):
-    """Rotation angles [rad] between quaternions."""
+    """Return the rotation angles [rad] between quaternions."""
     return (Rotation.from_quat(q).inv() * Rotation.from_quat(p)).magnitude()
 
 
-def test_slew_sampled_at_1_hz_has_the_accuracy_of_the_analytic_one():
+def test_interpolation_of_a_slew_sampled_at_1_hz_agrees_with_the_analytic_slew():
     times, between = np.arange(0.0, 76.0), np.linspace(0.0, 75.0, 4001)
     reference = references.interpolate_attitude(times, at(SLEW, times).q)
     found, true = at(reference, between), at(SLEW, between)
@@ -44,7 +45,7 @@ def test_slew_sampled_at_1_hz_has_the_accuracy_of_the_analytic_one():
     assert np.abs(found.w_dot - true.w_dot).max() < 3e-6  # h^2 theta'''' / 12 and a half
 
 
-def test_error_of_the_attitude_falls_with_the_fourth_power_of_the_interval():
+def test_error_of_an_interpolated_attitude_falls_with_the_fourth_power_of_the_interval():
     def error(step):
         times = np.arange(0.0, 40.0 + step, step)
         between = np.linspace(10.0, 30.0, 501)
@@ -53,7 +54,7 @@ def test_error_of_the_attitude_falls_with_the_fourth_power_of_the_interval():
     assert error(1.0) / error(0.5) == pytest.approx(16.0, rel=0.2)
 
 
-def test_samples_are_exact_and_signs_continuous():
+def test_interpolated_quaternion_is_exact_at_the_samples_and_never_changes_its_sign():
     flipped = wander(UNEVEN) * np.array([1, -1, -1, 1, 1, -1, 1, -1, 1])[:, None]
     reference = references.interpolate_attitude(UNEVEN, flipped)
     q = at(reference, UNEVEN).q
@@ -62,7 +63,7 @@ def test_samples_are_exact_and_signs_continuous():
     assert np.einsum("ij,ij->i", between[1:], between[:-1]).min() > 0.99
 
 
-def test_attitude_rate_and_acceleration_are_continuous():
+def test_interpolated_attitude_rate_and_acceleration_are_continuous():
     reference = references.interpolate_attitude(UNEVEN, wander(UNEVEN))
     before, after = (at(reference, UNEVEN[1:-1] * (1.0 + side)) for side in (-1e-13, 1e-13))
     for name in ("q", "w", "w_dot"):
@@ -89,14 +90,14 @@ def test_interpolated_attitude_far_from_the_ends_equals_the_rotation_spline_of_s
     np.testing.assert_allclose(at(reference, between).w, other(between, 1), atol=2e-6)
 
 
-def test_rates_at_the_ends_are_those_of_the_samples():
+def test_interpolated_rates_at_both_ends_equal_the_given_rates():
     times = np.arange(0.0, 9.0)
     ends = np.array([[0.1, 0.0, 0.2], [0.0, -0.1, 0.0]])
     reference = references.interpolate_attitude(times, wander(times), ends)
     np.testing.assert_allclose(at(reference, times[[0, -1]]).w, ends, atol=1e-15)
 
 
-def test_outside_of_the_samples_it_rests():
+def test_interpolated_reference_rests_outside_of_its_samples():
     reference = references.interpolate_attitude(UNEVEN, wander(UNEVEN))
     outside = at(reference, np.array([-1.0, 20.0]))
     assert apart(outside.q, wander(UNEVEN[[0, -1]])).max() < 1e-15
@@ -104,7 +105,8 @@ def test_outside_of_the_samples_it_rests():
     np.testing.assert_array_equal(outside.w_dot, np.zeros((2, 3)))
 
 
-def test_lanes_equal_single_evaluations_and_gradients_are_finite():
+def test_interpolation_of_a_batch_equals_single_ones_and_its_gradients_are_finite():
+    """`lanes.vmap` evaluates the batch with batched components."""
     reference = references.interpolate_attitude(UNEVEN, wander(UNEVEN))
     times = jnp.asarray([0.0, 0.7, 3.3, 9.0])
     batched = lanes.vmap(reference)(times)
@@ -118,7 +120,7 @@ def test_lanes_equal_single_evaluations_and_gradients_are_finite():
 @pytest.mark.parametrize(
     "times", [UNEVEN, np.linspace(0.0, 7.0, 50), np.array([0.0, 1e-3, 5.0]), np.array([-3.0, 4.0])]
 )
-def test_every_time_finds_its_interval(times):
+def test_interpolation_uses_the_interval_that_contains_the_time(times):
     reference = references.interpolate_attitude(times, wander(times))
     inside = np.sort(np.concatenate([times, np.random.default_rng(0).uniform(times[0], times[-1], 500)]))
     exact = CubicHermiteSpline(times, np.asarray(reference.samples), np.asarray(reference.slopes))(inside)

@@ -36,7 +36,7 @@ def build_reference(table, orbit=ORBIT, **others):
 
 
 def state(t, orbit=ORBIT):
-    """Position [m], velocity and acceleration in inertial axes."""
+    """Return position [m], velocity and acceleration on an orbit in inertial axes, computed by NumPy."""
     a, e, f_0 = orbit["semi_major_axis"], orbit["eccentricity"], orbit["true_anomaly"]
     e_0 = 2.0 * np.arctan(np.sqrt((1.0 - e) / (1.0 + e)) * np.tan(f_0 / 2.0))
     mean = e_0 - e * np.sin(e_0) + np.sqrt(MU / a**3) * t
@@ -49,13 +49,13 @@ def state(t, orbit=ORBIT):
 
 
 def unit_rate(p, p_dot):
-    """A unit vector and its time derivative."""
+    """Return the unit vector along p, and its time derivative."""
     size = np.linalg.norm(p)
     return p / size, p_dot / size - p * (p @ p_dot) / size**3
 
 
 def frame(first, second):
-    """Rotation matrix of a body whose axes `AXES` follow two directions, and its rate in body axes.
+    """Return the rotation matrix of a body whose axes `AXES` follow two directions, and its rate in body axes.
 
     Each direction is a vector and its derivative.
     """
@@ -73,7 +73,7 @@ def frame(first, second):
 
 
 def ground(t):
-    """Vector from the spacecraft to the ground target, and its derivative."""
+    """Return the vector from the spacecraft to the ground target, and its derivative."""
     a, f = 6378137.0, 1.0 / 298.257223563
     latitude, longitude, h = np.deg2rad(12.0), np.deg2rad(-25.0), 250.0
     n = a / np.sqrt(1.0 - f * (2.0 - f) * np.sin(latitude) ** 2)
@@ -85,11 +85,13 @@ def ground(t):
 
 
 def nadir(t):
+    """Return the vector from the spacecraft to the centre of the Earth, and its derivative."""
     r, v, _ = state(t)
     return -r, -v
 
 
 def velocity(t):
+    """Return the velocity of the spacecraft, and its derivative."""
     _, v, a = state(t)
     return v, a
 
@@ -109,7 +111,7 @@ CASES = {
 
 
 @pytest.mark.parametrize(("table", "first", "second"), CASES.values(), ids=CASES)
-def test_attitude_and_rate_equal_those_of_vectors(table, first, second):
+def test_attitude_and_rate_of_mission_references_equal_those_from_direction_vectors(table, first, second):
     reference = build_reference({**table, **AXES}, loop={"t_end": 7000.0})
     times = np.linspace(0.0, 7000.0, 57)  # more than one revolution
     targets = lapack.vmap(reference)(jnp.asarray(times))
@@ -121,7 +123,7 @@ def test_attitude_and_rate_equal_those_of_vectors(table, first, second):
 
 
 @pytest.mark.parametrize("table", [case[0] for case in CASES.values()], ids=CASES)
-def test_quaternion_is_continuous_and_consistent_with_rate_and_acceleration(table):
+def test_quaternion_of_mission_references_is_continuous_and_consistent_with_its_rates(table):
     reference = build_reference({**table, **AXES}, loop={"t_end": 7000.0})
     step = 1.0
     times = np.arange(0.0, 7000.0, step)
@@ -139,7 +141,7 @@ def test_quaternion_is_continuous_and_consistent_with_rate_and_acceleration(tabl
     np.testing.assert_allclose(derivative(w), w_dot[3:-3], rtol=0, atol=1e-9)
 
 
-def test_nadir_turns_with_the_orbit_and_points_down():
+def test_nadir_reference_turns_with_the_orbit_and_points_down():
     circle = {"semi_major_axis": 6.9e6, "inclination": 0.5}
     reference = build_reference({"kind": "nadir"}, circle)
     target, place = reference(jnp.asarray(321.0)), reference.orbit(jnp.asarray(321.0))
@@ -149,7 +151,7 @@ def test_nadir_turns_with_the_orbit_and_points_down():
     np.testing.assert_allclose(down, -np.asarray(place.radial), atol=1e-15)
 
 
-def test_nadir_and_ground_target_equal_those_of_basilisk():
+def test_nadir_and_ground_target_references_equal_those_of_basilisk():
     recorded = json.loads((Path(__file__).parent / "basilisk_references.json").read_text())
     orbit, times = recorded["orbit"] | {"earth_angle": 0.0}, jnp.asarray(recorded["times"])
     hill = {"kind": "nadir", "primary_axis": [-1, 0, 0], "secondary_axis": [0, 1, 0]}  # axes of the Hill frame
@@ -170,7 +172,7 @@ def test_nadir_and_ground_target_equal_those_of_basilisk():
         np.testing.assert_allclose(axis, row["target_direction"], rtol=0, atol=TOLERANCE)
 
 
-def test_a_target_below_the_horizon_gives_a_warning():
+def test_a_ground_target_below_the_horizon_causes_a_warning():
     orbit = {"inclination": 0.0, "earth_angle": 0.0}  # over longitude 0 at t = 0
     for longitude, hidden in ((0.05, False), (0.6, True)):
         table = {"kind": "ground_target", "longitude": longitude, "secondary": "orbit_normal"}
@@ -196,7 +198,7 @@ def test_gravity_gradient_is_that_of_the_orbit_and_within_its_bounds():
 
 
 @pytest.mark.parametrize("eccentricity", [0.0, 0.3, 0.9])
-def test_kepler_equation_and_its_derivatives(eccentricity):
+def test_radius_and_anomaly_of_an_orbit_obey_keplers_laws(eccentricity):
     orbit = build_reference({"kind": "nadir"}, ORBIT | {"eccentricity": eccentricity}).orbit
     times = np.linspace(0.0, 20_000.0, 401)
     e, p = eccentricity, 7.2e6 * (1.0 - eccentricity**2)
@@ -216,21 +218,22 @@ def test_kepler_equation_and_its_derivatives(eccentricity):
     ("date", "ascension"),
     [("2000-03-20T07:35:00", 0.0), ("2026-06-21T08:24:00", 90.0), ("2024-09-22T12:44:00", 180.0)],
 )
-def test_sun_is_at_the_equinoxes_and_solstices_on_time(date, ascension):
+def test_sun_direction_is_right_at_equinoxes_and_solstices(date, ascension):
     x, y, z = np.asarray(orbits.sun_direction(epochs.parse(date).days)(np.asarray(0.0), None, None, np))
     off = np.rad2deg(np.arctan2(y, x)) % 360.0 - ascension
     assert (off + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=0.02)  # half an hour
     assert np.rad2deg(np.arcsin(z)) == pytest.approx(23.44 * np.sin(np.deg2rad(ascension)), abs=0.02)
 
 
-def test_earth_angle_of_the_epoch():
+def test_earth_rotation_angle_has_the_standard_value_and_rate():
     assert orbits.earth_angle(0.0) == pytest.approx(2.0 * np.pi * 0.7790572732640, abs=1e-12)
     days = 9000.25
     rate = orbits.earth_angle(days + 1e-3) - orbits.earth_angle(days)
     assert rate / 86.4 == pytest.approx(EARTH_RATE, rel=1e-6)
 
 
-def test_reference_in_lanes_equals_the_single_one():
+def test_a_batch_of_a_ground_target_reference_equals_single_evaluations():
+    """`lanes.vmap` evaluates the batch with batched components."""
     reference = build_reference({"kind": "ground_target", **TARGET}, loop={"t_end": 900.0})
     times = jnp.asarray(np.linspace(0.0, 900.0, 7))
     batched, single = lanes.vmap(reference)(times), [reference(t) for t in times]
@@ -254,6 +257,6 @@ def test_reference_in_lanes_equals_the_single_one():
         ({"kind": "fixed"}, {"loop": {"epoch": "yesterday"}}, "loop.epoch"),
     ],
 )
-def test_configuration_errors_name_the_key(table, others, named):
+def test_configuration_errors_of_mission_references_name_the_key(table, others, named):
     with refuses(ScenarioError, named):
         scenario.from_tables({"reference": table, **MULTIPLICATIVE, **others})

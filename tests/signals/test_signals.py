@@ -102,7 +102,7 @@ SWING = references.Swing(
 
 
 @pytest.mark.parametrize("t", [0.0, 3.0, 41.0])
-def test_swing_rates_equal_jacobian_of_the_rotation_vector(t):
+def test_rates_of_an_oscillating_reference_equal_those_of_its_rotation_vector(t):
     def rotation_vector_at(t):
         return SWING.amplitude * jnp.sin(SWING.frequency * t + SWING.phase)
 

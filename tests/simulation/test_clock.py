@@ -15,7 +15,7 @@ from tests.helpers import ticks_of, vector
 
 @settings(max_examples=60, deadline=None)
 @given(t_f=st.floats(5.0, 40.0), share=st.floats(0.01, 0.4), coast=st.floats(1.0, 12.0))
-def test_anchored_periods_cover_the_run_and_have_a_sample_at_the_hand_over(t_f, share, coast):
+def test_periods_of_an_anchored_clock_cover_the_run_with_a_sample_at_the_hand_over(t_f, share, coast):
     period, delta = 0.1, max(share * t_f, 0.1)
     times = clock.anchored_clock(period, t_f + coast)
     ticks = ticks_of(times, vector(t_f), vector(delta))
@@ -43,7 +43,8 @@ def test_rounding_does_not_move_the_end_of_an_anchored_clock(period, t_f, delta,
 
 
 @pytest.mark.parametrize("periods", [10, 20])
-def test_anchored_ticks_are_continuous_in_delta_at_multiples_of_the_period(periods):
+def test_sample_times_of_an_anchored_clock_are_continuous_in_delta_at_multiples_of_the_period(periods):
+    """The anchored clock has a sample at the hand-over t_f - delta. Its partial first period vanishes at such delta."""
     anchored = clock.anchored_clock(0.1, 15.0)
 
     def ends(delta):
@@ -174,7 +175,7 @@ def test_an_anchored_clock_covers_the_run_for_any_hand_over(t_f, delta):
 
 
 @pytest.mark.parametrize(("t_f", "delta"), [(30.0, 0.05), (0.5, 0.001), (3000.0, 2.0), (10.0, 5.0)])
-def test_the_graded_grid_has_the_documented_nodes_and_steps(t_f, delta):
+def test_time_grid_of_the_continuous_loop_has_the_documented_nodes_and_steps(t_f, delta):
     saves = [0.3 * t_f, t_f - delta, t_f + 0.5]
     grid = clock.graded_clock(t_f, delta, t_f + 10.0, 1.0, 1.0, 0.1, (1e-3 * t_f, 1e-3), saves)
     ticks = ticks_of(grid, vector(t_f), vector(delta))
@@ -198,7 +199,7 @@ def test_the_graded_grid_has_the_documented_nodes_and_steps(t_f, delta):
     assert np.median(steps / allowed) > 0.8
 
 
-def test_graded_nodes_have_exact_derivatives_in_t_f_and_delta():
+def test_time_grid_of_the_continuous_loop_has_exact_derivatives_in_t_f_and_delta():
     grid = clock.graded_clock(30.0, 0.05, 45.0, 1.0, 1.0, 0.1, (3.0, 0.1))
 
     def nodes(t_f, delta):

@@ -101,7 +101,7 @@ def test_invalid_attitudes_and_inertias_are_refused_in_one_sentence():
         chain_parts([1.0, 0.0]).with_inertia([1.0, 1.0, 1.0])
 
 
-def test_a_reference_can_return_a_list():
+def test_a_reference_function_can_return_a_list():
     plain = parts(8.0, 3.0, 0.5, reference=lambda t: [0.0, 0.0, jnp.sin(t), jnp.cos(t)])
     np.testing.assert_allclose(jax.jit(plain.reference)(jnp.asarray(1.0)).w, [0.0, 0.0, 2.0], atol=1e-15)
 
@@ -191,7 +191,7 @@ def test_an_initial_state_of_integers_or_single_precision_is_simulated():
     assert shapes.log.x.q.dtype == float
 
 
-def test_study_and_replace_accept_a_file(tmp_path):
+def test_study_and_replace_accept_the_path_of_a_scenario_file(tmp_path):
     (tmp_path / "s.toml").write_text("controller = { eta = 3.5 }")
     assert float(ptsmc.study(tmp_path / "s.toml").parts.controller.eta) == 3.5
     assert ptsmc.replace(str(tmp_path / "s.toml"), controller__eta=4.0).controller.eta == 4.0

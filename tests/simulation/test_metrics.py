@@ -27,6 +27,7 @@ from tests.helpers import chain_flight, chain_parts, fly, parts, short, vector
 
 
 def simulated(**changes):
+    """Return the parts of a run, its metrics, and the rows of its history without periods of length zero."""
     run = parts(20.0, 3.0, 0.5, **changes)
     result = fly(run, 1, 4)
     log = result.log
@@ -35,6 +36,7 @@ def simulated(**changes):
 
 @pytest.fixture(scope="module", params=short(["continuous", "sampled", "flight"], ["continuous", "sampled"]))
 def run(request):
+    """Return parts, metrics and history of a continuous or a sampled run."""
     noisy = {"period": 0.05, "noise": (2e-4, 1e-5)}
     return simulated(**{"continuous": {}, "sampled": noisy, "flight": {**noisy, "flight": True}}[request.param])
 
@@ -118,6 +120,7 @@ def test_settling_time_matches_the_history(run):
 
 
 def interval(t, t_next, angles, torque=0.0, delivered=None):
+    """Return an interval of a run with the angles [rad] at both ends, and torques about x [N m]."""
     start, end = (Snapshot(vector(a), vector(a), vector(a)) for a in angles)
     u = vector([torque, 0.0, 0.0])
     got = u if delivered is None else vector([delivered, 0.0, 0.0])
@@ -136,6 +139,7 @@ def interval(t, t_next, angles, torque=0.0, delivered=None):
 
 
 def judge(intervals, t_end=4.0):
+    """Return the metrics of a run with these intervals. t_f and the window are 1 s, the settling angle is 0.1 rad."""
     criteria = Criteria(vector(1.0), vector(t_end), vector(1.0), vector(0.1))
     running, torque = metrics.begin(Start(intervals[0].start, 3, None), criteria), jnp.zeros(3)
     for one in intervals:
@@ -145,6 +149,10 @@ def judge(intervals, t_end=4.0):
 
 
 def test_settling_time_interpolates_restarts_and_can_be_nan():
+    """It is the last time at which the angle falls below the limit, interpolated in its interval.
+
+    It is NaN if the angle is larger at the end of the run.
+    """
     falls = judge([interval(0, 1, (1.0, 0.5)), interval(1, 2, (0.5, 0.3)), interval(2, 4, (0.3, 0.05))])
     np.testing.assert_allclose(falls.settling_time, 2.0 + 2.0 * 0.2 / 0.25)
     again = judge([interval(0, 1, (0.05, 0.05)), interval(1, 2, (0.05, 0.3)), interval(2, 4, (0.3, 0.05))])
@@ -154,7 +162,7 @@ def test_settling_time_interpolates_restarts_and_can_be_nan():
     assert np.isnan(float(judge([interval(0, 1, (1.0, 0.05)), interval(1, 4, (0.05, np.nan))]).settling_time))
 
 
-def test_saturation_is_a_time_and_peaks_distinguish_commanded_and_delivered():
+def test_saturated_is_a_fraction_of_time_and_peaks_distinguish_commanded_from_delivered_torque():
     found = judge([interval(0, 1, (1, 1), 3.0, 2.0), interval(1, 3, (1, 1), 1.0), interval(3, 4, (1, 1), -1.0)])
     np.testing.assert_allclose(found.saturated, 0.25)
     np.testing.assert_allclose([found.peak_torque, found.peak_torque_delivered], [3.0, 2.0])
@@ -208,7 +216,7 @@ def test_wheel_torque_is_the_largest_of_all_wheels():
     assert np.isnan(judge([interval(0, 4, (1.0, 1.0))]).peak_wheel_torque)
 
 
-def test_an_interval_of_length_zero_changes_nothing():
+def test_an_interval_of_length_zero_changes_no_metric():
     plain = [interval(0, 1, (1.0, 0.5), 1.0), interval(1, 4, (0.5, 0.2), 0.5)]
     with_empty = [plain[0], interval(1, 1, (9.0, 9.0), 99.0), plain[1]]
     wanted, found = judge(plain), judge(with_empty)
@@ -237,7 +245,7 @@ def test_metrics_of_many_runs_survive_jax_transformations():
 
 
 @pytest.mark.parametrize("flight", [False, True])
-def test_the_last_row_holds_the_torque_of_the_last_period(flight):
+def test_the_last_row_of_a_history_has_the_torque_of_the_last_period(flight):
     """Periods of length zero beyond t_end, and the period before t = 0, have no effect."""
     body = parts(20.0, 3.0, 0.53, period=0.05, noise=(2e-4, 1e-5))
     run = chain_flight() if flight else body  # with the compiled programs of other tests

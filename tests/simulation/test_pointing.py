@@ -81,7 +81,7 @@ def relative_share(t, error, mean_of, begins, window, t_end, limits) -> Any:
 
 @programs.jit(static_argnames="segments")
 def tallied(nodes, error, rate, begins, window, limits, segments=33):
-    """Return a tally over errors (n, 5) with their rates at nodes (n,)."""
+    """Return the accumulated pointing indices of errors (n, 5) with their rates at nodes (n,)."""
 
     def step(tally, row):
         t, t_next, start, start_rate, end, end_rate = row
@@ -93,7 +93,7 @@ def tallied(nodes, error, rate, begins, window, limits, segments=33):
 
 
 def indices(tally):
-    """Return the indices by name."""
+    """Return the pointing indices of a tally by name, each about x, y, z and of the half-cone."""
     return {"ape": tally.largest, "mpe": tally.mean, "rpe": tally.relative, "pde": pointing.drift(tally)}
 
 
@@ -103,7 +103,7 @@ OBSERVED = [(4.0, 1.0), (4.0, 0.37), (4.03, 0.1), (0.0, 2.5), (3.999, 3.0)]
 
 
 @pytest.mark.parametrize(("begins", "window"), OBSERVED)
-def test_indices_match_a_brute_force_evaluation(begins, window):
+def test_pointing_indices_match_a_brute_force_evaluation(begins, window):
     def check(seed):
         rng = np.random.default_rng(seed)
         error, rate = rng.normal(size=(NODES.size, 5)), 10.0 * rng.normal(size=(NODES.size, 5))
@@ -136,7 +136,8 @@ def test_indices_match_a_brute_force_evaluation(begins, window):
         check(seed)
 
 
-def test_a_constant_error_has_no_deviation_and_a_ramp_has_half_its_rise():
+def test_relative_error_is_zero_for_a_constant_error_and_half_the_rise_of_a_ramp():
+    """The relative error is the error minus its mean over a window."""
     error = np.tile([1.0, -2.0, 3.0, 0.6, 0.8], (NODES.size, 1))
     tally = tallied(*map(jnp.asarray, (NODES, error, 0.0 * error, 2.0, 1.0, np.full((3, 4), np.inf))))
     np.testing.assert_allclose(tally.largest, [1.0, 2.0, 3.0, 1.0], rtol=1e-14)
@@ -151,7 +152,7 @@ def test_a_constant_error_has_no_deviation_and_a_ramp_has_half_its_rise():
 
 @programs.jit
 def held(nodes, error, begins, window):
-    """Return a tally over errors (n, 5), each held from a node to the next node."""
+    """Return the accumulated pointing indices of errors (n, 5), each held from a node to the next node."""
 
     def step(tally, row):
         t, t_next, value = row
@@ -177,7 +178,7 @@ def test_a_held_error_counts_in_the_windows_that_it_is_held_in(begins, window):
 
 
 def check_the_cone(seed):
-    """Compare with the angle between both boresights, and with the rotation vector of SciPy."""
+    """Compare the half-cone with the angle between both boresights, and the error with the rotation vector of SciPy."""
     rng = np.random.default_rng(seed)
     b = rng.normal(size=3)
     frame = pointing.boresight_frame(b)
@@ -227,6 +228,7 @@ rke_x = { limit = 1e-5, probability = 0.95, interpretation = "mixed" }
 
 @pytest.fixture(scope="module")
 def simulated():
+    """Return the study of a run with pointing requirements, and its result."""
     tables = untuned(POINTED)
     tables["loop"] |= {"clock": "flight"}
     ready = scenario.study(scenario.from_tables(tables))
@@ -310,14 +312,14 @@ def test_knowledge_errors_are_the_measurement_noise(simulated):
         assert float(getattr(found, f"mke_{axis}")) == pytest.approx(np.abs(means)[:, k].max(), rel=1e-6)
 
 
-def test_a_window_with_too_many_samples_has_no_fraction_of_time():
+def test_fraction_of_time_of_the_relative_error_is_nan_with_too_many_samples_in_a_window():
     error = np.zeros((NODES.size, 5))
     asked = [jnp.asarray(given) for given in (NODES, error, error, 4.0, 1.0, np.ones((3, 4)))]
     np.testing.assert_array_equal(tallied(*asked).relative_beyond, 0.0)
     assert np.all(np.isnan(tallied(*asked, segments=9).relative_beyond))
 
 
-def test_a_continuous_run_has_room_for_all_its_steps():
+def test_pointing_indices_of_a_continuous_run_allow_for_all_its_steps_in_a_window():
     frame = pointing.boresight_frame((0.0, 0.0, 1.0))
     zero, one = jnp.zeros(()), jnp.ones(())
     asked = pointing.Pointing(jnp.asarray(frame), zero, one, {"rpe_z": one})
@@ -326,7 +328,7 @@ def test_a_continuous_run_has_room_for_all_its_steps():
     assert dataclasses.replace(asked, samples=12).for_run(700).segment_count("rpe") == 14
 
 
-def test_gradients_of_indices_match_finite_differences():
+def test_gradients_of_pointing_indices_match_finite_differences():
     """The direction changes attitudes, rates, times of nodes and the begin of the observation together."""
     rng, frame = np.random.default_rng(5), vector(pointing.boresight_frame((1.0, 2.0, -0.5)))
     decay = np.exp(-0.3 * NODES)[:, None]  # so that the first window and its first moment are among the largest
@@ -346,7 +348,7 @@ def test_gradients_of_indices_match_finite_differences():
     assert np.all(np.abs(slopes) > 1e-6)
 
 
-def test_every_index_is_a_metric_of_a_scenario_with_pointing(simulated):
+def test_every_pointing_index_is_a_metric_of_a_scenario_with_pointing(simulated):
     ready, _ = simulated
     named = {f"{index}_{axis}" for index in catalogues.INDICES for axis in catalogues.AXES}
     assert named | {"within_ape_boresight", "within_rpe_boresight", "within_rke_x"} <= set(ready.catalogue)

@@ -12,12 +12,13 @@ BEYOND = np.nextafter(LIMIT, 1.0)
 
 
 def verdict(values, ok=None, metric="peak_torque"):
+    """Return the verdict on the values of trials by a limit of 0.5; ok: False for a failed trial."""
     values = np.asarray(values, dtype=float)
     return Requirement(metric, LIMIT).verdict(values, np.ones(values.shape, bool) if ok is None else np.asarray(ok))
 
 
 @pytest.mark.parametrize(("value", "ok", "met"), [(LIMIT, True, True), (BEYOND, True, False), (0.1, False, False)])
-def test_verdict_on_a_single_run(value, ok, met):
+def test_a_single_run_meets_a_limit_if_it_completes_and_does_not_exceed_it(value, ok, met):
     told = Requirement("peak_torque", LIMIT).verdict(np.asarray(value), np.asarray(ok))
     assert (told.met, told.failures, told.trials) == (met, int(not met), 1)
 
@@ -109,7 +110,7 @@ def test_a_three_sigma_requirement_needs_852_trials():
     (5, 0.99, 0.9, True), (6, 0.99, 0.9, False),
     (0, 0.9999, 0.9, False),
 ])  # fmt: skip
-def test_a_requirement_on_a_fraction_of_the_trials(beyond, quantile, confidence, met):
+def test_a_requirement_on_a_fraction_of_the_trials_allows_some_violations(beyond, quantile, confidence, met):
     values = np.linspace(0.1, LIMIT, 1000)
     values[:beyond] = BEYOND + np.arange(beyond) * 0.01
     told = Requirement("peak_torque", LIMIT, None, quantile, confidence).verdict(values, np.ones(1000, bool))
@@ -176,6 +177,7 @@ INDEX = "ape_boresight"
 
 
 def of_time(interpretation, within, probability=0.9973, confidence=None, ok=None, values=None):
+    """Return the verdict on a fraction of time; within: fraction of time in which each run keeps the limit."""
     within = np.asarray(within, dtype=float)
     asked = Requirement(INDEX, 1e-3, "rad", probability, confidence, interpretation=interpretation)
     assert asked.timed == f"within_{INDEX}"
@@ -183,7 +185,7 @@ def of_time(interpretation, within, probability=0.9973, confidence=None, ok=None
     return asked.verdict(values, np.ones(within.shape, bool) if ok is None else ok, within)
 
 
-def test_temporal_requires_a_fraction_of_the_time_in_every_run():
+def test_temporal_interpretation_requires_a_fraction_of_the_time_in_every_run():
     kept = np.full(RUNS, 1.0)
     kept[7] = 0.998
     told = of_time("temporal", kept)
@@ -200,7 +202,7 @@ def test_temporal_requires_a_fraction_of_the_time_in_every_run():
     assert not of_time("temporal", np.ones(RUNS), ok=np.arange(RUNS) > 0).met  # a failed run counts as 0
 
 
-def test_mixed_requires_a_fraction_of_the_time_of_all_runs():
+def test_mixed_interpretation_requires_a_fraction_of_the_time_of_all_runs():
     never = of_time("mixed", np.ones(852), confidence=0.9)
     assert never.met  # as many runs without a violation as for an ensemble
     assert never.shown == pytest.approx(0.1 ** (1 / 852))
@@ -238,7 +240,7 @@ def test_a_single_run_is_judged_by_its_fraction_of_the_time():
             assert asked.verdict(np.asarray(2e-3), np.asarray(True), np.asarray(share)).met is met
 
 
-def test_ensemble_is_the_same_as_a_quantile():
+def test_ensemble_interpretation_is_the_same_as_a_quantile():
     asked = Requirement(INDEX, 1e-3, "rad", 0.9973, 0.9)
     assert asked.timed is None
     assert asked.implied_by == asked

@@ -152,7 +152,7 @@ def test_motion_under_held_torque_matches_an_adaptive_integrator():
 
 
 @pytest.mark.parametrize("kind", ["anchored", "flight"])
-def test_the_last_row_has_the_estimate_and_s_of_a_sample_at_t_end(kind):
+def test_the_last_row_of_a_history_has_the_estimate_and_s_of_a_sample_at_t_end(kind):
     """It equals the row at this time in a longer run, which has a sample there. The torque is still the held one."""
     chain = {"plant": {"kind": "chain", "order": 2}, "observer": {"kind": "nonlinear"},
              "controller": {"t_f": 3.0, "delta": 1.0}, "hardware": {"state_noise": [1e-5, 1e-6]}}  # fmt: skip
@@ -171,7 +171,7 @@ def test_the_last_row_has_the_estimate_and_s_of_a_sample_at_t_end(kind):
 
 
 @pytest.mark.parametrize("flight", [False, True])
-def test_metrics_at_t_f_are_taken_inside_the_period(flight):
+def test_metrics_at_a_t_f_between_two_samples_use_the_motion_at_t_f(flight):
     body = with_controller(at_20_hz(20.0, 3.0, 0.53), t_f=vector(20.02))  # t_f = t_s + 10.6 periods
     run = chain_flight() if flight else body
     t_f = float(run.controller.t_f)
@@ -211,7 +211,7 @@ def test_status_of_singular_and_diverged_runs():
 
 
 @pytest.mark.parametrize(("disturbance", "status"), [(0.5, rollout.OK), (50.0, rollout.NOT_CONVERGED)])
-def test_a_run_that_starts_on_the_target_is_missed_beyond_ten_settling_angles(disturbance, status):
+def test_a_run_that_starts_on_the_target_has_not_converged_beyond_ten_settling_angles(disturbance, status):
     """The limit of 5 % of the initial error is 0 here, so the limit of ten settling angles of 1e-3 applies.
 
     A constant disturbing acceleration a leaves the error a tau^2 / (eta - 2)^2 at tau = delta, here 1.25e-3 and 0.125.
@@ -244,6 +244,7 @@ def test_runs_that_did_not_converge_have_finished():
 
 
 def simulated(plant, mode, **tables):
+    """Simulate a scenario with this plant, mode of the loop and other tables."""
     loop = {"mode": mode, "settling_angle": 1e-3}
     return runs.simulate(scenario.study(scenario.from_tables({"plant": plant, "loop": loop, **tables})))
 
@@ -279,7 +280,7 @@ def test_a_spacecraft_with_an_overflowing_momentum_is_not_ok():
         assert np.isfinite(float(result.metrics.window_error))
 
 
-def test_either_sign_of_the_quaternion_is_the_same_run():
+def test_either_sign_of_the_initial_quaternion_gives_the_same_run():
     q = parts().initial.q
     one, other = fly(parts()), fly(parts(q=-q))
     np.testing.assert_array_equal(one.log.x.q, other.log.x.q)
@@ -305,7 +306,7 @@ def test_other_numbers_use_the_same_compiled_program(monkeypatch):
     assert len(traced) <= 1  # 0 if another test has compiled it
 
 
-def test_a_run_is_its_control_periods_one_after_the_other():
+def test_control_periods_computed_one_by_one_give_the_run():
     observer = nonlinear.NonlinearObserver(integrator_chain.chain(2), vector([10.0]), vector(1e-3), vector(0.0))
     run = chain_parts([1.0, 0.2], delta=0.5, period=0.5, noise=[2e-5, 1e-6], observer=observer)
     log = fly(run, 1, 2).log
@@ -348,7 +349,7 @@ def test_observer_and_controller_use_the_design_model():
     np.testing.assert_array_equal(run.observer.model.inertia, run.controller.model.inertia)
 
 
-def test_gains_beyond_the_clock_are_refused():
+def test_a_t_f_beyond_the_samples_of_the_clock_gives_an_incomplete_run():
     """The clock `TIGHT` covers any delta, but not a t_f whose run ends after its last sample."""
     run = parts(20.0, 3.0, 0.5, period=0.25, noise=(2e-4, 1e-5))
     run = replace(run, clock=TIGHT)
