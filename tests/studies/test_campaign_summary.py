@@ -28,7 +28,7 @@ FRAME = pl.DataFrame({
     ("temporal", [KEPT, AT_TIMES, BEYOND, "diverged"],
      "required: 80 % of the time, in every run; seen: at least 0 %"),
 ])  # fmt: skip
-def test_outcomes_distinguish_requirements_that_allow_violations_for_some_time(interpretation, outcomes, said):
+def test_figures_mark_trials_beyond_a_limit_that_allows_this_for_some_time(interpretation, outcomes, said):
     asked = Requirement("ape_z", 1.0, "rad", quantile=0.8, interpretation=interpretation)
     assert campaign_figures._classify_trials(FRAME, [asked])[0].tolist() == outcomes
     torque = Requirement("peak_torque", 2.0, "N m")
@@ -85,7 +85,7 @@ def test_worst_trials_by_successful_samples_have_the_fewest():
 
 
 @pytest.mark.parametrize(("count", "rows", "looked"), [(None, [], None), (3, [0, 1, 2], 3), (900, [0, 1, 2, 3], 256)])
-def test_bound_and_margins_use_the_first_trials_and_are_computed_once(tmp_path, monkeypatch, count, rows, looked):
+def test_bound_and_margins_of_a_campaign_use_its_first_trials_once(tmp_path, monkeypatch, count, rows, looked):
     """A run table has the lower bound of at most its first 4 rows, and the margins of at most its first 256 rows."""
     asked: list[Any] = []
 
@@ -154,7 +154,7 @@ def test_figures_name_the_required_metric_of_the_marked_trials(monkeypatch):
 @pytest.mark.parametrize(("first", "broken", "trials"), [
     (20, 0, "20 trials"), (5, 0, "the first 5 of 20 trials"), (5, 2, "the first 5 of 20 trials, 2 failed"),
 ])  # fmt: skip
-def test_the_error_over_time_counts_the_trials_that_it_shows(monkeypatch, first, broken, trials):
+def test_figure_of_the_error_over_time_states_how_many_trials_it_shows(monkeypatch, first, broken, trials):
     """An earlier version showed 1000 of 2000 trials as all trials of the campaign."""
     finished, ready = np.arange(20) >= broken, scenario.study(scenario.from_tables({}))
     frame = pl.DataFrame({"trial": np.arange(20), "window_error": np.linspace(1e-6, 1e-5, 20)})

@@ -34,6 +34,7 @@ TABLES = tomllib.loads(SHORT)
 
 
 def tuned(scenario):
+    """Return the table [tune] of a scenario that has one."""
     assert scenario.tune is not None
     return scenario.tune
 
@@ -224,7 +225,7 @@ def test_every_law_appears_in_table_page_and_figures(eight, tmp_path):
         assert (tuned, colours["published"]) == (style.STYLES[0][0], style.STYLES[1][0])
 
 
-def test_settling_times_of_small_and_large_initial_angles():
+def test_settling_times_are_medians_over_the_smallest_and_over_the_largest_initial_angles():
     angle, settling = np.linspace(0.3, 2.4, 100), np.concatenate([np.full(50, 30.0), np.full(50, 33.0)])
     assert compare._median_settling_times(angle, settling) == (30.0, 33.0)
     assert compare._median_settling_times(-angle, angle) == (
@@ -259,22 +260,25 @@ def test_all_laws_have_free_gains_if_t_f_is_minimised():
 
 @pytest.fixture(scope="module")
 def eight():
+    """Return eight simulated trials of a spacecraft."""
     ready = scenario.study(judging.on_flight_clock(scenario.from_tables(TABLES)))  # the compiled program of judging
     return montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(8))
 
 
 def contender(trials, **changes):
+    """Return the result of a compared law with these held-out trials."""
     base = scenario.from_tables(TABLES)
     verdicts = judging.verdicts_of(base, trials, 0)
     return compare.Contender(base, {}, {}, {}, trials, changes.get("verdicts", verdicts), None)
 
 
 def changed(trials, status, **metrics):
+    """Return the trials with another status and other values of metrics."""
     numbers = {name: np.asarray(value, dtype=float) for name, value in metrics.items()}
     return replace(trials, status=np.asarray(status, dtype=np.int32), metrics=Metrics({**trials.metrics, **numbers}))
 
 
-def test_statistics_of_a_contender_use_finished_trials(eight):
+def test_statistics_of_a_compared_law_use_its_finished_trials(eight):
     nan, ok, bad = np.nan, rollout.OK, rollout.DIVERGED
     trials = changed(eight, [ok] * 6 + [rollout.NOT_CONVERGED, bad], window_error=[1.0] * 5 + [2.0, 3.0, 99.0],
                      peak_torque=[1.0] * 5 + [2.0, 3.0, 99.0],
@@ -332,7 +336,7 @@ def test_all_laws_are_tuned_by_one_seed_and_judged_by_another(monkeypatch, eight
     )
 
 
-def test_the_function_compares_the_same_laws_as_the_command(monkeypatch, eight):
+def test_function_and_command_compare_the_same_laws(monkeypatch, eight):
     asked = rivals(monkeypatch, eight)
     found = tuning.compare(scenario.from_tables(TABLES), against=["pd"], seed=5)
     assert [(law, seed) for what, law, seed in asked if what == "tune"] == [("prescribed_time", 5), ("pd", 5)]
@@ -412,6 +416,7 @@ def test_plain_numbers_of_a_custom_law_cause_a_warning_before_and_after_the_sear
 
 
 def lines_of(summary):
+    """Return the sentences of the report of this comparison."""
     return list(compare_report.gain_lines(summaries.read(summaries.Compare, summary)))
 
 

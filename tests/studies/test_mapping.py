@@ -55,6 +55,7 @@ def parse_map(x, y, text=SHORT):
 
 
 def simulated(x, y, text=SHORT, trials=6):
+    """Simulate a map with few trials in each cell; return its scenario, its axes and its cells."""
     loaded, across, up = parse_map(x, y, text)
     return loaded, across, up, mapping.simulate(loaded, across, up, 3, trials, lambda done, total: None).cells
 
@@ -67,7 +68,7 @@ def simulated(x, y, text=SHORT, trials=6):
         ({"t_f": 35.0, "delta": 4.0}, 0.05, [(0.02, 0.5), (0.05, 8.0)]),  # up to twice the scenario's delta
     ],
 )
-def test_the_default_axes_follow_the_period_and_t_f_of_the_scenario(controller, period, ends):
+def test_the_default_axes_of_a_map_follow_the_period_and_t_f_of_the_scenario(controller, period, ends):
     made = scenario.from_tables({"controller": controller, "loop": {"mode": "sampled", "period": period}})
     axes = (
         mapping.parse_axis(mapping.default_period_axis(made), "--x", made),
@@ -78,7 +79,7 @@ def test_the_default_axes_follow_the_period_and_t_f_of_the_scenario(controller, 
     assert [len(axis.values) for axis in axes] == [9, 9]
 
 
-def test_the_default_y_axis_of_a_law_without_delta_is_its_first_gain():
+def test_the_default_y_axis_of_a_map_is_the_first_gain_of_a_law_without_delta():
     law = {"kind": "time_base_sliding", "t_f": 35.0}
     made = scenario.from_tables({"controller": law, "loop": {"mode": "sampled"}, "observer": {"kind": "none"}})
     axis = mapping.parse_axis(mapping.default_gain_axis(made), "--y", made)
@@ -104,15 +105,15 @@ def test_the_default_y_axis_of_a_law_without_delta_is_its_first_gain():
         ("requirements.peak_torque=1:2:2", [1.0, 2.0]),
     ],
 )
-def test_axes(text, values):
-    """Earlier, the text of an axis was 1:6:4 for delays of 1, 2, 4 and 6 periods, but it gives other delays."""
+def test_an_axis_of_a_map_has_the_values_of_its_text(text, values):
+    """The text that results store gives the same values again. An earlier text gave other delays."""
     made = scenario.from_tables({})
     axis = mapping.parse_axis(text, "--x", made)
     assert mapping.parse_axis(axis.text, "--x", made).values == axis.values
     np.testing.assert_allclose(axis.values, values, rtol=5e-6)  # six digits
 
 
-def test_axes_have_the_units_of_their_keys():
+def test_labels_of_map_axes_have_the_units_of_their_keys():
     loaded = scenario.from_tables(tomllib.loads(SHORT))
     shown = {"controller.delta": "[s]", "observer.gain[0]": "[N m s]", "hardware.rate_noise": "[rad/s]"}
     for key, unit in shown.items():
@@ -140,7 +141,7 @@ def test_invalid_axes_of_a_map_are_refused(text):
         mapping.parse_axis(text, "--y", scenario.from_tables({}))
 
 
-def test_the_refusal_of_a_range_has_the_unit_of_its_key():
+def test_error_for_an_invalid_range_of_a_map_names_the_unit_of_its_key():
     with pytest.raises(UsageError, match='in s or with a unit such as "200 ms"'):
         mapping.parse_axis("loop.period=1m:2m:3", "--x", scenario.from_tables({}))
 
@@ -149,17 +150,18 @@ def test_the_refusal_of_a_range_has_the_unit_of_its_key():
     ("spacecraft", "torque_limit", "the nearest known keys are hardware.torque_limit, wheels.torque_limit"),
     ("chain", "etta", "the nearest known key is controller.eta"),
 ])  # fmt: skip
-def test_the_refusal_of_a_key_without_its_table_names_the_nearest_keys(plant, key, nearest):
+def test_error_for_a_key_of_a_map_without_its_table_names_the_nearest_keys(plant, key, nearest):
     with pytest.raises(UsageError, match=re.escape(nearest)):
         mapping.parse_axis(f"{key}=1:2:3", "--x", scenario.from_tables({"plant": {"kind": plant}}))
 
 
 @pytest.fixture(scope="module")
 def mapped():
+    """Return the simulated map of a chain with two periods and two values of delta."""
     return simulated("loop.period=0.05:0.2:2", "controller.delta=0.1:0.5:2", CHAIN)
 
 
-def test_cells_agree_with_separate_simulations_of_their_pair(mapped, monkeypatch):
+def test_cells_of_a_map_agree_with_separate_simulations_of_their_pair(mapped, monkeypatch):
     loaded, x, y, cells = mapped
     assert [(c.x, c.y) for c in cells] == [(a, b) for b in y.values for a in x.values]
     refused = [c for c in cells if c.status != "simulated"]
@@ -192,7 +194,7 @@ def test_cells_agree_with_separate_simulations_of_their_pair(mapped, monkeypatch
     assert any(cell.radius < 1.0 for cell in cells)
 
 
-def test_a_map_says_which_pairs_keep_every_requirement(monkeypatch):
+def test_a_map_reports_which_pairs_keep_every_requirement(monkeypatch):
     """Earlier, the best pair of a map was the most accurate one, whatever its torque."""
     text = (
         CHAIN
@@ -227,7 +229,7 @@ def not_simulated(monkeypatch):
 
 
 @pytest.mark.usefixtures("not_simulated")
-def test_margins_of_a_pd_law_agree_with_the_closed_form():
+def test_margins_of_a_pd_law_in_a_map_agree_with_the_closed_form():
     """The loop is a PD law, a zero-order hold and a double integrator. Earlier, maps had margins of one law only."""
     text = CHAIN.replace("t_f = 5.0, delta = 0.5", 'kind = "pd", t_f = 5.0')
     text = text.replace('{ kind = "nonlinear", gain = [10.0] }', '{ kind = "none" }')
@@ -265,7 +267,7 @@ def test_gain_factor_below_one_gives_the_distance_to_the_nearest_stability_limit
         ([[10.0, 0, 0], [0, 12.0, 0], [0, 0, 14.0]], "spacecraft.inertia[0]", "such as three principal moments"),
     ],
 )
-def test_an_inertia_is_not_replaced_by_a_number(inertia, key, refused):
+def test_a_map_does_not_replace_an_inertia_by_one_number(inertia, key, refused):
     loaded = scenario.from_tables({"spacecraft": {"inertia": inertia}})
     with pytest.raises(ScenarioError, match=re.escape(refused)):
         mapping.simulate(
@@ -274,7 +276,7 @@ def test_an_inertia_is_not_replaced_by_a_number(inertia, key, refused):
         )  # fmt: skip
 
 
-def test_value_is_set_on_all_axes_and_in_missing_keys():
+def test_a_map_sets_a_value_on_all_axes_and_in_keys_that_the_scenario_omits():
     loaded, _, _ = parse_map("hardware.torque_lag=0.01:0.1:2", "controller.delta=1:2:2")
     changed: Any = mapping._with_keys(loaded, {"observer.gain": 7.0, "hardware.torque_lag": 0.2, "hardware.delay": 1.0})
     assert changed.observer.gain == (7.0, 7.0, 7.0)
@@ -294,7 +296,7 @@ def test_time_after_t_f_is_constant_if_t_f_is_mapped():
     assert ends == [6.0, 7.0, 14.0, 15.0]  # 2 s after t_f, or the window if it is longer
 
 
-def test_random_walk_disturbance_makes_trials_differ():
+def test_trials_of_a_map_are_random_with_a_random_walk_disturbance():
     text = 'loop = { mode = "sampled", period = 0.1 }\ncontroller = { t_f = 5.0, delta = 0.5 }\n'
     still, walking = (parse_map("controller.eta=3:4:2", "controller.delta=0.5:0.6:2", text + kind)[0]
                       for kind in ("", "disturbance.kind = 'random_walk'"))  # fmt: skip

@@ -43,6 +43,7 @@ def test_required_fraction_of_the_peak_torque_counts_failed_trials(lost, largest
 
 
 def point(peak, rms, **others):
+    """Return a point of a front with this peak torque and RMS error."""
     return front.Point(peak, {}, rms=rms, costs={"peak_torque": peak}, **others)
 
 
@@ -53,7 +54,7 @@ def trials(errors):
     return Trials(np.arange(len(errors)), metrics, ok, np.full(len(errors), np.nan), {})
 
 
-def test_dominated_points_are_worse_by_more_than_the_interval():
+def test_dominated_points_of_a_front_are_worse_by_more_than_the_confidence_interval():
     rng = np.random.default_rng(0)
     common = rng.lognormal(0.0, 0.5, 400)
     sizes = {0.2: 4.0, 0.3: 2.0, 0.4: 2.5, 0.5: 1.0, 0.6: 1.0005}  # by peak torque
@@ -69,14 +70,14 @@ def test_dominated_points_are_worse_by_more_than_the_interval():
     assert not any(p.knee and p.dominated for p in marked)
 
 
-def test_points_with_zero_or_missing_error_are_not_the_knee():
+def test_points_with_zero_or_missing_error_are_not_the_knee_of_a_front():
     """Their logarithms are not finite. Earlier, such a point became the knee."""
     sizes = {0.2: 4.0, 0.3: 2.0, 0.5: 1.6, 0.6: 0.0, np.nan: np.nan}
     judged = [(point(peak, size), trials([size])) for peak, size in sizes.items()]
     assert [p.peak for p in pareto.mark_points(judged) if p.knee] == [0.3]
 
 
-def test_points_with_more_failures_or_too_few_trials_do_not_dominate():
+def test_points_of_a_front_with_more_failures_or_too_few_trials_do_not_dominate():
     """A point has half the error at less torque, but failed trials, or too few trials for an interval.
 
     A single trial without dispersions has no interval and can dominate.
@@ -173,7 +174,7 @@ def test_torque_front_does_not_need_a_torque_limit():
 
 
 @pytest.mark.parametrize("limit", [None, 0.5, 1.001, 1.4, 1.5, 3.0, 5.0, 6.0, 15.9, 16.0])
-def test_own_torque_limit_replaces_the_nearest_default_limit(limit):
+def test_torque_limit_of_the_scenario_replaces_the_nearest_default_limit_of_a_front(limit):
     """The nearest limit is in logarithms. The ends stay, because searches have found feasible gains for them."""
     usual = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
     ladder, middle = trades.limits_between(1.0, 16.0, 5, limit)
@@ -184,7 +185,7 @@ def test_own_torque_limit_replaces_the_nearest_default_limit(limit):
 
 
 @pytest.mark.parametrize(("found", "best"), [(None, 2.0), (3.0, 2.0), (1.5, 1.5)])
-def test_refined_target_is_not_worse_than_the_known_feasible_gains(monkeypatch, found, best):
+def test_refined_gains_of_a_front_are_not_worse_than_known_feasible_gains(monkeypatch, found, best):
     """F is the gain itself. Gain 1 breaks the limit, gain 2 keeps it. The local search finds nothing, 3 or 1.5."""
 
     def measured(problem, normalised):

@@ -23,6 +23,7 @@ CHAIN = SHORT_CHAIN.replace('mode = "sampled"', 'mode = "sampled"\nclock = "flig
 
 
 def tables(path):
+    """Return the rows of a CSV file."""
     with path.open() as file:
         return list(csv.DictReader(file))
 
@@ -88,7 +89,7 @@ def of_axes(rows, found, names, seen):
     assert all(float(row["time_to_go"]) > 0.0 for row in rows if row not in hold)
 
 
-def test_table_has_every_axis_and_summary_has_the_worst_axis(tmp_path):
+def test_margin_table_has_every_axis_and_its_summary_has_the_worst_axis(tmp_path):
     """The margins are random numbers."""
     ready, rng = scenario.study(scenario.from_tables(untuned(SHORT))), np.random.default_rng(3)
 
@@ -153,6 +154,7 @@ def test_unstable_hold_phase_is_reported_with_negative_margins(command, tmp_path
 
 
 def reported(summary):
+    """Return the report of `ptsmc margins` for a summary."""
     return margins_report.build(summaries.read(summaries.Margins, summary))
 
 

@@ -96,11 +96,12 @@ def test_larger_margins_reduce_the_accuracy(command, tmp_path, monkeypatch):
         ),
     ],
 )
-def test_invalid_options_are_refused(command, tmp_path, options, said):
+def test_invalid_options_of_pareto_are_refused(command, tmp_path, options, said):
     assert said in refused(command, tmp_path, "pareto", "s.toml", *options)
 
 
 def slew_time(known):
+    """Return the trade of accuracy against a t_f of 20 and of 30 s."""
     return trades.SlewTime(known, (20.0, 30.0))
 
 
@@ -138,13 +139,13 @@ WORST_CASE = {"tune": {"worst_case": True}}
         ),
     ],
 )
-def test_scenarios_without_this_front_are_refused(trade, changes, said):
+def test_scenarios_that_do_not_allow_a_front_are_refused(trade, changes, said):
     known = scenario.from_tables({"loop": {"mode": "sampled"}, "controller": {"t_f": 20.0}, **changes})
     with refuses(ScenarioError, said):
         trade(known).check()
 
 
-def test_default_limits_include_the_limit_of_the_scenario():
+def test_default_limits_of_a_front_against_margins_include_the_limit_of_the_scenario():
     tables = tomllib.loads(SHORT_CHAIN)
     usual = [np.inf, 12.0, 8.0, 6.0, 5.0, 4.0, 3.0]
     assert trades.Margins(scenario.from_tables(tables)).values == usual
@@ -152,7 +153,7 @@ def test_default_limits_include_the_limit_of_the_scenario():
     assert trades.Margins(asked).values == sorted([*usual, 5.5], reverse=True)
 
 
-def test_sensitivity_limit_replaces_the_margins_that_it_bounds():
+def test_sensitivity_limit_of_a_front_replaces_required_gain_and_phase_margins():
     asked = {
         "peak_torque": 3.0,
         "gain_margin": 8.0,
@@ -236,7 +237,7 @@ def test_slew_time_trade_accepts_an_observer_with_a_given_t_o():
     trades.SlewTime(scenario.from_tables({"controller": {"t_f": 20.0}, **known}), (20.0, 30.0)).check()
 
 
-def test_default_times_are_half_to_twice_the_time_of_the_scenario():
+def test_default_times_of_a_front_against_t_f_are_half_to_twice_the_t_f_of_the_scenario():
     assert trades.SlewTime(scenario.from_tables({})).values == [15.0, 21.0, 30.0, 42.0, 60.0]
 
 
@@ -262,7 +263,7 @@ def test_costs_of_a_slew_are_the_metrics_of_the_scenario():
     assert set(trades.SLEW_COSTS) <= set(catalogues.CATALOGUES["spacecraft"])
 
 
-def test_default_bounds_of_delta_follow_the_shortest_time():
+def test_default_bounds_of_delta_follow_the_shortest_t_f_of_a_front():
     """The default bounds of t_f = 8 s reach to 2 s, which a prescribed time of 1.9 s does not allow."""
     tables = {
         "plant": {"kind": "chain", "x0": [1.0, 0.0]},

@@ -93,8 +93,8 @@ def test_tuning_of_delta_or_t_f_uses_the_anchored_clock(free, anchored):
     assert posed.ready.scenario == (scenario.from_tables(tables) if anchored else simulated)
 
 
-def test_reach_covers_the_bounds_and_the_own_values_of_the_gains():
-    """The reach covers the bounds, and the scenario's own value if it is outside the bounds."""
+def test_reach_of_a_tuning_covers_the_bounds_and_the_gains_of_the_scenario():
+    """The reach is the range of times and gains for which clock and integration steps are chosen."""
     wide = {"eta": [2.1, 9.0], "delta": [0.1, 4.0], "t_f": [20.0, 60.0], "observer_gain": [2.0, 50.0],
             "k1": [0.5, 7.0], "sign_width": [1e-4, 1e-2], "surface_rate": [0.2, 3.0]}  # fmt: skip
     made = scenario.from_tables({"controller": {"sign_width": 1e-3}, "tune": {"free": [*wide], "bounds": wide}})
@@ -154,7 +154,7 @@ def test_influence_of_a_gain_is_unknown_if_no_trial_finishes(objective, said):
         ({"minimise": "effort", "statistic": "quantile"}, "quantile_effort", "90 % quantile of effort"),
     ],
 )
-def test_every_column_of_a_history_has_its_own_name(tune, column, name):
+def test_the_objective_in_the_history_of_a_search_is_named_after_its_metric(tune, column, name):
     tables = tomllib.loads(SHORT_CHAIN) | {"tune": {"free": ["eta", "t_f"], **tune}}
     some = scenario.from_tables(tables)
     columns = tune_files.history_columns(some, ["peak_torque"])
@@ -175,7 +175,7 @@ class Found:
 
     @property
     def normalised(self) -> np.ndarray:
-        """Gains between the bounds 0 and 1; here all are at the upper bound."""
+        """Return the gains as fractions of their bounds. All are at the upper bound."""
         return np.ones(len(self.gains))
 
 
@@ -198,6 +198,7 @@ class Rising:
         self.evaluate.measure = measure
 
     def search(self, problem: Any, gains: Any, starts: int, report: Any) -> Found:
+        """Record the bounds, and return the gains at the upper bounds."""
         self.searched.append(dict(self.ready.scenario.search.bounds))
         self.evaluate.rollouts += 10
         upper = np.array(self.evaluate.bounds.upper)
@@ -247,7 +248,7 @@ def test_violations_that_a_repeated_search_cannot_fix_are_ignored(metric, values
     assert tuner._broken_ratios(cast("Any", found), [verdict]) == pytest.approx(over)
 
 
-def test_default_gain_equals_its_explicit_value():
+def test_a_scenario_with_default_gains_is_compared_with_the_published_gains_once():
     """The scenario omits the bandwidth of the filter. Its default equals the published gain."""
     loaded = scenario.read(ROOT / "scenarios" / "filtered_flight.toml")
     assert list(judging.reference_scenarios(loaded)[0]) == ["published"]
@@ -294,6 +295,7 @@ def test_held_out_trials_of_the_search_program_equal_those_of_a_campaign(gain):
 
 
 def test_published_gains_of_another_law_are_judged_without_the_search_program():
+    """The compiled program of a search serves only its own law. The held-out trials equal those of a campaign."""
     loaded = scenario.replace(scenario.from_tables(tomllib.loads(SHORT_CHAIN)), tune=None, controller={"kind": "pd"})
     problem = posing.set_up_tuning(posing.with_tune(loaded), 0).problem
     published = judging.reference_scenarios(loaded)[0]["published"]
@@ -301,7 +303,7 @@ def test_published_gains_of_another_law_are_judged_without_the_search_program():
     np.testing.assert_array_equal(judged.metrics.window_error, campaign.metrics.window_error)
 
 
-def test_judging_changes_only_the_clock():
+def test_scenario_of_held_out_trials_differs_only_in_the_flight_clock():
     loaded = scenario.read(FIRST_FLIGHT)
     simulated = judging.on_flight_clock(loaded)
     assert simulated.loop.clock == "flight"

@@ -29,7 +29,7 @@ ROOM, LATE_ROOM = (8, 2, 2), (9, 2, 1)
 
 
 def of(loop, **how):
-    """Margins of a loop. Small loops are padded so that one compiled program serves all of them."""
+    """Return the margins of a loop. Small loops are padded so that one compiled program serves all of them."""
     sizes, room = (*loop.seen.shape, len(loop.command)), {0: ROOM, 1: LATE_ROOM}.get(loop.delay)
     if not how and room is not None and np.all(np.array(sizes) <= room):
         loop = larger(loop, *room)
@@ -51,7 +51,7 @@ def with_gradients(loop, way):
 
 
 def larger(loop, n, k, m):
-    """The loop padded with states and inputs that have no effect."""
+    """Return the loop padded with states and inputs that have no effect."""
     sizes = {"a": (n, n), "seen": (n, k), "new": (n, m), "old": (n, m), "command": (m, n), "direct": (m, k),
              "disturbed": (n, m)}  # fmt: skip
 

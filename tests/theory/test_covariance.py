@@ -77,7 +77,7 @@ def test_covariance_predicts_the_error_of_simulated_trials(case, trials, start):
 
 
 def simulated_chain(**changes):
-    """Window error of 2 000 trials of a chain of order 2 at rest on its target, by one compiled program."""
+    """Return the parts of a chain of order 2 at rest on its target, and the RMS window error of 2 000 trials."""
     tables = {
         "plant": {"kind": "chain", "x0": [0.0, 0.0]},
         "loop": {"mode": "sampled", "clock": "flight", **changes.pop("loop")},
@@ -107,7 +107,7 @@ def test_noise_reports_whether_the_statistical_linearisation_converged(monkeypat
     assert covariance.propagate_noise(scenario.study(scenario.from_tables(tables)).parts).converged is converged
 
 
-def test_window_error_includes_the_error_between_samples():
+def test_predicted_window_error_includes_the_error_between_samples():
     """The window contains only one sample, 0.49 s after t_f."""
     parts, simulated = simulated_chain(
         controller={"t_f": 15.01, "delta": 0.9, "k1": 3.0, "sign_width": 0.01, "surface_rate": 1.5},
@@ -119,7 +119,7 @@ def test_window_error_includes_the_error_between_samples():
     np.testing.assert_allclose(covariance.propagate_noise(parts).window_error, simulated, rtol=0.05)
 
 
-def test_a_random_walk_acts_from_the_start_of_its_period():
+def test_predicted_effect_of_a_random_walk_begins_at_the_start_of_a_period():
     """The window has few periods of 1 s. A step that acts one period later would predict a much smaller error."""
     parts, simulated = simulated_chain(
         controller={"t_f": 4.0, "delta": 2.0, "k1": 0.5, "sign_width": 1e3},
@@ -178,7 +178,7 @@ def test_covariance_analysis_does_not_apply_to_implicit_sampling_or_perfect_sens
 
 
 @pytest.mark.parametrize("width", [1e-4, 0.02, 0.1, 0.3, 2.0, 30.0])
-def test_equivalent_width_matches_numerical_integration(width):
+def test_equivalent_width_of_a_sign_with_noise_matches_numerical_integration(width):
     """The trapezium rule integrates E[sech^2(n / width)] / width with at least 16 steps in a width."""
     reach, step = min(12.0, 40.0 * width), min(1.0, width) / 16.0  # the integrand is below 1e-31 beyond `reach`
     n = np.linspace(-reach, reach, 2 * round(reach / step) + 1)
@@ -189,7 +189,7 @@ def test_equivalent_width_matches_numerical_integration(width):
     assert covariance._equivalent_width(0.0, 1.0) == pytest.approx(np.sqrt(np.pi / 2.0), rel=1e-12)
 
 
-def test_equivalent_width_follows_the_noise_of_each_period():
+def test_equivalent_width_of_the_sign_follows_the_noise_of_each_period():
     """Compare the deviations of command and s with 200 trials; s is 25 times as noisy in the approach phase.
 
     The trials determine each deviation to 5 % and the largest of 160 to about 20 %. A single equivalent width, that of

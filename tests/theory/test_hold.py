@@ -24,7 +24,10 @@ GRID = (4000, 800)
 
 
 def simulated(law, c, k):
-    """A run without disturbance or switching, whose hand-over 2 s before t_f = 10 s leaves a large error."""
+    """Return a run without disturbance or switching.
+
+    The hand-over is 2 s before t_f = 10 s, so that a large error remains.
+    """
     t_end = 12.0
     grid = clock.Graded(vector(t_end), vector(1.0), vector(1.5 * 10.0 / GRID[0]), jnp.zeros(0), *GRID)
     if isinstance(law, int):
@@ -38,7 +41,7 @@ def simulated(law, c, k):
 
 @jax.jit
 def exact(run, t):
-    """Error, s and acceleration of the closed forms at times t in the hold phase."""
+    """Return error, s and acceleration of the closed forms at times t in the hold phase."""
     law = run.controller
 
     def component(x0):

@@ -79,7 +79,7 @@ def test_limit_cycle_detection_needs_sixteen_full_periods(whole, judged):
     assert (limit_cycles.find(parts, seen._replace(in_hold=told)) is not None) == judged
 
 
-def test_without_margins_sets_positive_margins_to_zero_and_keeps_negative_ones():
+def test_zero_margins_replaces_positive_margins_and_keeps_negative_ones():
     stable = np.array([[True], [True], [False]])
     values: Any = {name: np.array([[3.0], [3.0], [-3.0]]) for name in margins.Margins._fields} | {"stable": stable}
     left = limit_cycles.zero_margins(margins.Margins(**values), [False, True, True])

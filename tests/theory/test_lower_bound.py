@@ -21,7 +21,10 @@ PERIOD = 0.125  # a power of two, so that t_f and the ends of the window are exa
 
 
 def still(made):
-    """A history at rest with the duration of the scenario; only the fields that `lower_bound` reads have values."""
+    """Return a history at rest with the duration of the scenario.
+
+    Only the fields that `lower_bound` reads have values.
+    """
     periods = int(np.ceil(float(made.t_end) / PERIOD))
 
     def kept(v):
@@ -35,11 +38,12 @@ def still(made):
 
 
 def simulated_at(made, **changes):
-    """The parts with the flight clock and changed devices."""
+    """Return the parts with the flight clock and changed devices."""
     return dataclasses.replace(made, clock=clock.flight_clock(PERIOD, float(made.t_end)), **changes)
 
 
 def delayed(periods):
+    """Return actuators with a delay of whole periods."""
     return actuators.Actuators(delay=periods)
 
 
@@ -91,7 +95,7 @@ def rms_in_window(parts, squares):
     return np.sqrt(np.sum(squares[inside] @ np.array([1, 4, 1]) / 6) * PERIOD / window)
 
 
-def test_deviations_attain_farrenkopfs_steady_state():
+def test_deviations_of_attitude_and_gyro_bias_attain_farrenkopfs_steady_state():
     """The closed form for attitude and gyro bias is from Markley and Reynolds (2000)."""
     interval, star, gyro, walk = 0.25, 2e-5, 1e-5, 3e-6
     s_v, s_u = gyro * math.sqrt(interval) / star, walk * interval**1.5 / star
@@ -221,7 +225,7 @@ def test_lower_bound_of_a_spacecraft_at_rest_equals_least_squares(kind):
     np.testing.assert_allclose(found.window_error, rms_in_window(made, squares), rtol=1e-8)
 
 
-def test_along_each_equals_separate_calls():
+def test_lower_bounds_of_several_runs_equal_separate_calls():
     """The runs differ in noise, delay and duration, and one has no uncertainty."""
 
     def chain(t_f=2.0, noise: Any = (1e-3, 5e-2), delay=0):
@@ -242,14 +246,14 @@ def test_along_each_equals_separate_calls():
     assert lower_bound.bounds_along_runs([]) == []
 
 
-def test_a_state_measured_without_noise_is_known():
+def test_lower_bound_with_an_exact_rate_is_the_noise_of_the_mean_position():
     """The rate is known to be zero, so that the best estimate of the position is the mean of all samples."""
     made = simulated_at(chain_parts([1.0, 0.0], t_f=2.0, period=PERIOD, noise=[1e-3, 0.0]))
     found = lower_bound.bound_along_run(made, still(made))
     np.testing.assert_allclose(found.error, 1e-3 / np.sqrt(1.0 + np.arange(len(found.t))), rtol=1e-9)
 
 
-def test_without_noise_only_the_random_walk_is_unknown():
+def test_lower_bound_without_noise_is_the_effect_of_the_random_walk_in_a_period():
     """All states are measured exactly. Only the effect of the walk's step within a period remains."""
     density = 0.2
     made = simulated_at(chain_parts([1.0, 0.0], t_f=2.0, period=PERIOD), walk_rate=vector([density]))
@@ -277,7 +281,7 @@ def test_lower_bound_is_zero_without_noise():
         np.testing.assert_array_equal(found.error, 0.0)
 
 
-def test_wheel_momentum_couples_the_axes():
+def test_wheel_momentum_couples_the_axes_in_the_linearised_run():
     """At rest with wheel momentum h a small rate obeys J dw' = h x dw."""
     momentum = np.array([3.0, -2.0, 1.0])
     device = actuators.wheels(np.eye(3), momentum)

@@ -39,7 +39,7 @@ CHAIN = {
 
 
 def chain(**changes):
-    """A chain's parts, its loop in the hold phase, and kp, kd of a = -kp x1 - kd x2."""
+    """Return a chain's parts, its loop in the hold phase, and kp, kd of a = -kp x1 - kd x2."""
     parts = scenario.study(scenario.replace(scenario.from_tables(CHAIN), **changes)).parts
     law = parts.controller
     reaching = float(law.k1) + float(parts.observer.error_bound().largest) / float(law.sign_width)
@@ -48,6 +48,7 @@ def chain(**changes):
 
 
 def opened(parts, hold=True):
+    """Return the open loop of the last full period in the hold phase, or in the approach phase."""
     run = linear.simulate_nominal_jit(parts)
     for side in (True, False):
         periods = linear.full_periods(parts, run, hold=side)
@@ -59,6 +60,7 @@ def opened(parts, hold=True):
 
 @pytest.mark.parametrize("m", [1, 3, 4])
 def test_one_axis_loop_equals_a_ratio_of_determinants(m):
+    """The loop of one axis includes the feedback of all other axes."""
     parts = np.random.default_rng(m).normal(size=(2, 5, m, m))
     L = parts[0] + 1j * parts[1]
     rest = np.eye(m) + L
@@ -69,7 +71,7 @@ def test_one_axis_loop_equals_a_ratio_of_determinants(m):
     np.testing.assert_allclose(crossings.axis_responses(jnp.asarray(L)), expected, rtol=1e-11)
 
 
-def test_grid_includes_resonances_of_loops_with_an_open_axis():
+def test_frequency_grid_includes_resonances_of_loops_with_an_open_axis():
     """Feedback damps two oscillators. If an axis is open, its oscillator is undamped."""
     size, h = 1.0 - 1e-5, 0.1
     turns = [size * np.array([[np.cos(at), -np.sin(at)], [np.sin(at), np.cos(at)]]) for at in (0.7, 1.3)]
@@ -163,6 +165,7 @@ def simulated(parts, run, index, gain, late):
 
 @jax.jit
 def _simulated(parts, run, index, gain, late):
+    """Return the logarithm of a small deviation after each of 6000 repetitions of one period."""
     period, carry_0, _, base = jax.tree.map(lambda v: v[index], run)
     k2 = parts.observer.error_bound()
     delay = parts.actuators.delay
@@ -395,7 +398,7 @@ def test_random_loops_are_stable_for_all_delays_below_the_margin(seed):
         bears_delays_below_its_margin(loop, most=1.001)
 
 
-def test_zeros_of_linear_functions_are_found_exactly():
+def test_zeros_of_linear_complex_functions_on_a_grid_are_found_exactly():
     """One function has a zero inside a cell. Another one is real at the last point and has a zero there."""
     row, point = np.meshgrid(np.arange(7.0), np.arange(9.0), indexing="ij")
 
@@ -548,13 +551,13 @@ def test_a_pole_on_the_unit_circle_is_not_a_crossing(at, lag, feedback):
     assert np.isfinite(found.gain_up[0])
 
 
-def test_sine_of_a_zero_loop_is_finite_in_single_precision():
+def test_sine_of_the_phase_of_a_zero_loop_is_finite_in_single_precision():
     """An earlier guard against 0 / 0 was itself zero in 32 bits."""
     with jax.enable_x64(False):
         np.testing.assert_array_equal(crossings.sine(jnp.asarray([0.0, 2j, -3.0], jnp.complex64)), [0.0, 1.0, 0.0])
 
 
-def test_responses_of_figures_are_smooth_near_a_resonance():
+def test_frequency_responses_in_figures_are_smooth_near_a_resonance():
     """An earlier version drew the circle of a flexible mode with seven points."""
     a = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0], [0.0, 0.0, -4.0, -0.004]])
     b = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 0.1], [0.1, 1.0]])
@@ -615,7 +618,7 @@ def test_hold_loop_does_not_depend_on_delta(delta):
     (40.0, 0.2, 0.1, (1.0, 10.0)),  # from ten periods before t_f, where gains change by a tenth per period
     (40.0, 12.0, 0.1, (12.0, 12.0)),  # delta exceeds a quarter of t_f
 ])  # fmt: skip
-def test_judged_times_are_between_hand_over_and_a_quarter_of_t_f(t_f, delta, period, ends):
+def test_margins_are_judged_between_the_hand_over_and_a_quarter_of_t_f_to_go(t_f, delta, period, ends):
     tables = {"plant": {"kind": "chain"}, "controller": {"t_f": t_f, "delta": delta}}
     made = scenario.from_tables({**tables, "loop": {"mode": "sampled", "period": period}})
     spread = np.geomspace(ends[0], ends[1], 4)

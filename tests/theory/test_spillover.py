@@ -39,17 +39,18 @@ def few_together(monkeypatch):
 
 
 def parts_of(**changes):
+    """Return the parts of a spacecraft with one flexible mode and these tables."""
     return scenario.study(scenario.from_tables({**SPILLS, **changes})).parts
 
 
 def in_theory(**changes):
-    """Parts with noise, which does not affect loops, and padded time grids, so that compiled programs are shared."""
+    """Return parts with noise, which does not affect loops, and padded time grids, to share compiled programs."""
     parts = parts_of(**NOISY, **changes)
     return replace(parts, clock=roomy(parts.clock), substeps=25)
 
 
 def in_hold(parts):
-    """The linearised loop of the last full period in the hold phase."""
+    """Return the linearised loop of the last full period in the hold phase."""
     run = linear.simulate_nominal_jit(parts)
     index = linear.full_periods(parts, run, hold=True)[-1:]
     width = np.asarray(parts.controller.sign_width)[None]  # as in `covariance`, to share its compiled program
@@ -87,7 +88,10 @@ def test_covariance_of_noise_and_random_walk_equals_simulated_trials():
 
 
 def slowest_pair(y):
-    """Modulus r of the dominant pole pair of an oscillation, from y(k + 2) = 2 r cos(a) y(k + 1) - r^2 y(k)."""
+    """Return the modulus r of the dominant pole pair of an oscillation y.
+
+    Its samples obey y(k + 2) = 2 r cos(a) y(k + 1) - r^2 y(k).
+    """
     return np.sqrt(-np.linalg.lstsq(np.stack([y[1:-1], y[:-2]], axis=1), y[2:])[0][1])
 
 

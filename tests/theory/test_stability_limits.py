@@ -11,7 +11,7 @@ from tests.helpers import commanded, parts, vector
 
 
 @pytest.mark.parametrize("t", [3.0, 18.9, 19.6])
-def test_gains_are_the_derivatives_of_the_law(t):
+def test_linear_gains_are_the_derivatives_of_the_law(t):
     """Automatic differentiation of the closed loop gives the derivatives of eps'' by eps and eps' at the reference."""
     run = parts(20.0, 3.4, 1.0, inertia=(10.0,) * 3, k1=1.7, sign_width=0.05, surface_rate=2.3)
     law, k2 = run.controller, vector(0.02)
@@ -33,7 +33,7 @@ def test_gains_are_the_derivatives_of_the_law(t):
 
 
 def simulated_radius(kp, kd, h, late):
-    """Growth per period of a double integrator under delayed sampled feedback, by time stepping."""
+    """Return the growth per period of a double integrator under delayed sampled feedback, by time stepping."""
     fine = 20
     state, commands = np.array([1.0, 0.3]), [0.0] * 10
     sizes = []

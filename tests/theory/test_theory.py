@@ -57,7 +57,7 @@ def test_first_torque_equals_the_simulated_torque_and_the_angle_formula():
 
 
 @pytest.mark.parametrize("eta", [2.05, 2.1, 2.2, 2.3])
-def test_braking_peak_of_a_small_slew(eta):
+def test_braking_torque_of_a_small_slew_has_the_predicted_peak(eta):
     """Compare the ratio to the initial torque, and the time of the peak, with a simulation without disturbance."""
     small = np.array([0.0, 0.0, np.sin(0.01), np.cos(0.01)])
     run = parts(30.0, eta, 1e-9, q=small, disturbance=QUIET, rate_bound=0.0, t_end=31.0)
@@ -70,7 +70,7 @@ def test_braking_peak_of_a_small_slew(eta):
     assert 0.93 < remaining < 1.07
 
 
-def test_narrowest_sign_is_crossed_in_one_period():
+def test_boundary_layer_of_the_smallest_sign_width_is_crossed_in_one_period():
     run = parts(30.0, 3.0, 0.05, inertia=FULL_INERTIA)
     width = envelopes.smallest_sign_width(run, 0.05)
     before, _ = envelopes.boundary_layer(run.controller, run.observer.error_bound().largest)
@@ -99,7 +99,7 @@ def test_exact_path_equals_the_simulated_path():
 
 
 def random_body(rng):
-    """Random inertia of point masses, which is physically possible."""
+    """Return a random inertia of point masses, which is physically possible."""
     points = rng.normal(size=(6, 3)) * rng.uniform(0.3, 2.0, size=3)
     return np.trace(points.T @ points) * np.eye(3) - points.T @ points
 
@@ -123,7 +123,7 @@ SPACECRAFT = st.fixed_dictionaries(
 
 
 def grid(t_f):
-    """Time grid with the number of steps of `roomy`, to share a compiled program."""
+    """Return a time grid with the number of steps of `roomy`, to share a compiled program."""
     return clock.Graded(vector(t_f + 10.0), vector(1.0), vector(1.5 * t_f / 512), jnp.zeros(0), 512, 512)
 
 
@@ -170,7 +170,7 @@ test_many_spacecraft_stay_inside = pytest.mark.long(drawn(stays_inside_the_corre
 
 
 def slew(seed, eta, t_f):
-    """An undisturbed slew from rest of a random body from a random attitude 5 to 150 degrees away."""
+    """Return an undisturbed slew from rest of a random body, from a random attitude 5 to 150 degrees away."""
     rng = np.random.default_rng(seed)
     angle, axis = np.deg2rad(rng.uniform(5.0, 150.0)), rng.normal(size=3)
     q = np.append(np.sin(angle / 2) * axis / np.linalg.norm(axis), np.cos(angle / 2))
@@ -179,7 +179,7 @@ def slew(seed, eta, t_f):
 
 
 @pytest.mark.parametrize("below", [False, True], ids=["eta from 2.4 to 6", "eta from 2.05 to 2.4"])
-def test_shortest_time_is_sufficient_for_fifty_spacecraft(below):
+def test_shortest_t_f_by_rule_3_5_keeps_the_torque_limit_for_fifty_spacecraft(below):
     """Rule 3.5 is accurate to 1 % for eta >= 2.4. Below it is conservative, because it uses a small-angle factor."""
     rng = np.random.default_rng(5)
     for seed in range(50):
@@ -216,7 +216,7 @@ def test_exact_input_equals_the_simulated_input():
     np.testing.assert_allclose(against, np.broadcast_to([0.01, -0.02, 0.0], against.shape), atol=1e-12)
 
 
-def test_first_torque_to_a_reference_other_than_the_identity():
+def test_first_torque_to_another_reference_equals_the_simulated_torque():
     q_f = np.array([0.2, -0.3, 0.1, np.sqrt(1 - 0.14)])
     run = parts(25.0, 3.5, 0.5, inertia=FULL_INERTIA, reference=references.Fixed(vector(q_f)))
     log = fly(run).log
