@@ -36,7 +36,7 @@ def exported(tmp_path_factory):
     return place, rows
 
 
-def test_process_behind_udp_returns_the_outputs_of_the_c(exported):
+def test_controller_process_behind_udp_returns_the_outputs_of_the_exported_c(exported):
     place, rows = exported
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
@@ -63,7 +63,7 @@ def test_process_behind_udp_returns_the_outputs_of_the_c(exported):
             process.terminate()
 
 
-def test_shared_library_returns_the_outputs_of_the_c(exported):
+def test_shared_library_returns_the_outputs_of_the_exported_c(exported):
     place, rows = exported
     library = ctypes.CDLL(str(place / "controller.so"))
     library.controller_new.restype = ctypes.c_void_p

@@ -570,7 +570,7 @@ def test_report_has_the_expected_text(name):
     assert text_of(CASES[name]()) == expected()[name]
 
 
-def test_every_expected_text_has_a_case():
+def test_every_expected_text_of_a_report_has_a_case():
     assert expected().keys() == CASES.keys()
 
 

@@ -25,7 +25,7 @@ INERTIAS = [np.diag(PAPER_INERTIA), np.array(FULL_INERTIA), random_body(0), rand
 
 
 @pytest.mark.parametrize("inertia", INERTIAS)
-def test_the_rate_follows_eulers_equation(inertia):
+def test_rates_of_a_rigid_body_follow_eulers_equation_and_the_kinematics(inertia):
     rng = np.random.default_rng(4)
     body = rigid_body.spacecraft(inertia)
     for _ in range(5):

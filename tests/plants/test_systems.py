@@ -279,12 +279,13 @@ def test_invalid_system_names_are_refused(plant, said):
         ({"controller": {"error": "multiplicative"}}, "controller.error is not a known key"),
     ],
 )
-def test_keys_of_a_system_must_have_its_size(changes, said):
+def test_invalid_keys_of_a_custom_system_are_refused(changes, said):
     with pytest.raises(ScenarioError, match="^" + re.escape(said)):
         scenario.from_tables(arm_tables(**changes))
 
 
-def test_systems_from_python_and_from_files_survive_replace(tmp_path: Path):
+def test_replace_and_repeated_reading_keep_the_same_custom_system(tmp_path: Path):
+    """All runs with the same object share a compiled program."""
     made = one_coordinate()
     tables = {"plant": {"kind": "system", "system": made, "x0": [0.1, 0.0]}}
     changed = scenario.study(scenario.replace(scenario.from_tables(tables), controller__eta=4.0))
@@ -361,7 +362,7 @@ def test_singularity_of_a_system_is_relative_to_its_initial_state_in_any_units(s
     assert fly(run).status == (rollout.SINGULAR if singular else rollout.OK)
 
 
-def test_a_singular_matrix_at_the_start_is_refused_by_name():
+def test_a_custom_system_with_a_singular_matrix_at_the_start_is_refused():
     with pytest.raises(ScenarioError, match=r"^plant\.system has a singular dF/dx2 G at t = 0 in plant\.x0"):
         study(one_coordinate(G=lambda t, a, b: jnp.zeros((1, 1))), [1.0, 0.0])
     with pytest.raises(ScenarioError, match=r'singular D .*observer\.kind = "nonlinear" must invert; .*"none"$'):
@@ -378,7 +379,7 @@ def test_a_singular_matrix_at_the_start_is_refused_by_name():
         ({"D": lambda t, a, b: jnp.eye(1) / b[0]}, "D = [[inf]]"),
     ],
 )
-def test_functions_that_are_not_finite_at_the_start_are_refused_by_name(changes, said):
+def test_a_custom_system_that_is_not_finite_at_the_start_is_refused_with_its_function(changes, said):
     with pytest.raises(ScenarioError, match=f"^{re.escape(f'plant.system has {said} at t = 0 in plant.x0; allowed')}"):
         study(one_coordinate(**changes), [1.0, 0.0])
 

@@ -341,7 +341,7 @@ def test_a_file_named_by_several_keys_is_reported_once(tmp_path, capsys):
     assert capsys.readouterr().err == f"ptsmc: runs {law}, which {keys} of {tmp_path} name\n"
 
 
-def test_a_program_without_a_checksum_in_the_results_is_reported(tmp_path, capsys):
+def test_a_custom_file_without_a_checksum_in_the_results_is_reported(tmp_path, capsys):
     law, other = tmp_path / "mine.py", tmp_path / "other.py"
     law.write_text("")
     other.write_text("")

@@ -87,13 +87,13 @@ def test_disturbance_bounds_include_dispersions():
     assert bounds(disturbance=table, dispersion=normal) == pytest.approx((4.3e-3, 1.3e-3), rel=1e-15)  # rounding
 
 
-def test_several_disturbances_add_up_component_by_component():
+def test_bounds_of_several_disturbances_add_up_component_by_component():
     terms = [{"kind": "constant", "amplitude": [3e-3, 0.0, 0.0]},
              {"kind": "sinusoid", "amplitude": [0.0, 4e-3, 0.0], "frequency": [1.0] * 3}]  # fmt: skip
     assert bounds(disturbance={"kind": "sum", "terms": terms}) == (4e-3, 4e-3)
 
 
-def test_independent_random_walks_add_up_by_their_squares():
+def test_densities_of_independent_random_walks_add_up_by_their_squares():
     """Two walks with densities of 3 and 4 on the same axis are one walk with a density of 5."""
 
     def walking(*densities):

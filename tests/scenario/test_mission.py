@@ -42,7 +42,7 @@ def test_defaults_of_a_chain_scale_with_t_f(order):
     ],
     ids=str,
 )
-def test_published_cases_keep_the_published_numbers(changes, published):
+def test_default_gains_of_published_cases_are_the_published_gains(changes, published):
     law = scenario.from_tables({**SAMPLED, **changes}).controller
     assert mission.is_published_case(scenario.from_tables(changes)) == published
     found = (law.eta, law.delta, law.k1, law.surface_rate, law.sign_width)

@@ -191,7 +191,7 @@ FINITE = [(bad, f"{bad} is no finite number") for bad in (math.nan, math.inf, -m
 
 
 @pytest.mark.parametrize(("bad", "shown"), [*FINITE, (True, "true"), ("1.0", '"1.0"'), ([1.0], "[1.0]"), ({}, "{")])
-def test_other_types_and_numbers_that_are_not_finite_are_refused(bad, shown):
+def test_every_number_of_a_scenario_must_be_finite_and_of_the_right_type(bad, shown):
     for tables, path in NUMBERS:
         said = refusal(changed(tables, path, bad))
         assert said.startswith(f"{key_of(path)} is ")
@@ -247,11 +247,11 @@ def test_a_value_instead_of_a_table_is_refused(name):
         ({"kind": "normal", "std": 0.1}, '{ kind = "normal", std = 0.1 }'),
     ],
 )
-def test_values_are_shown_as_a_scenario_file_would_write_them(value, shown):
+def test_error_messages_show_values_as_a_scenario_file_would_write_them(value, shown):
     assert errors.show(value) == shown
 
 
-def test_dump_omits_none_and_keeps_zero():
+def test_dump_of_a_scenario_omits_none_and_keeps_zero():
     dumped = parsing.dump(from_tables({"hardware": {"rate_noise": 0.0}, "loop": {"mode": "sampled"}}))
     assert dumped["hardware"] == {"rate_noise": 0.0}
     assert {"requirements", "tune", "dispersion"}.isdisjoint(dumped)

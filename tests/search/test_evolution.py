@@ -95,12 +95,12 @@ def test_gains_with_a_failed_trial_are_not_accepted(seed):
     assert 0.2**2 <= best.f <= 0.2**2 + 5.0 * evolution.LEAST_DECREASE
 
 
-def test_a_single_gain_is_optimised():
+def test_differential_evolution_optimises_a_single_gain():
     best, _ = refined(Quadratic(np.array([[4.0]])), [0.4])
     assert best.f < 1e-6
 
 
-def test_search_ends_early_without_progress():
+def test_differential_evolution_ends_early_without_progress():
     _, told = refined(Quadratic(np.zeros((2, 2))), [0.1, 0.1])
     assert len(told) <= evolution.PATIENCE + 1
 
@@ -119,13 +119,13 @@ def test_first_generation_is_around_the_starting_point_or_in_the_whole_box(size)
         np.testing.assert_allclose(first.mean(axis=0), 0.0, atol=0.02)
 
 
-def test_search_approaches_a_limit_that_no_point_can_keep():
+def test_differential_evolution_approaches_a_limit_that_no_point_can_keep():
     best, told = refined(Quadratic(np.eye(2), np.array([1.0, 1.0]), least=3.0), [-0.3, -0.3])
     assert len(told) == evolution.GENERATIONS
     assert best.violation < 2.01  # x is 0.5 at most
 
 
-def test_the_starting_point_remains_if_all_points_fail():
+def test_differential_evolution_returns_the_starting_point_if_all_points_fail():
     best, _ = refined(Quadratic(np.eye(2), wall=-1.0), [0.1, 0.2])
     assert not np.isfinite(best.f)
     np.testing.assert_allclose(best.normalised, [0.6, 0.7])

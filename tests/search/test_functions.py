@@ -60,12 +60,12 @@ def test_points_with_an_undefined_objective_are_avoided():
 
 
 @pytest.mark.parametrize("bounds", [[(0.0, 0.0)], [(1.0, -1.0)], [(0.0, float("inf"))]])
-def test_an_empty_or_infinite_box_raises(bounds):
+def test_minimise_refuses_an_empty_or_infinite_box(bounds):
     with pytest.raises(ValueError, match="bounds are"):
         minimise(lambda x: x[0], None, bounds)
 
 
-def test_results_depend_on_the_seed_only():
+def test_results_of_minimise_depend_on_the_seed_only():
     one, again, other = (
         minimise(lambda x: jnp.sum(jnp.cos(3.0 * x) + 0.1 * x**2), None, [(-5.0, 5.0)] * 2, Settings(seed=seed))
         for seed in (1, 1, 2)

@@ -16,7 +16,7 @@ def ask(journal, count, asked):
     return [journal.get(b"question %d" % k, lambda k=k: compute(k)) for k in range(count)]
 
 
-def test_a_second_run_reads_the_records_of_the_first_run(tmp_path):
+def test_a_second_run_reads_the_journal_of_the_first_run(tmp_path):
     first, again, asked = [], [], []
     wrote = ask(Journal(tmp_path / "j"), 5, first)
     read = ask(Journal(tmp_path / "j"), 7, again)
@@ -54,6 +54,7 @@ def test_a_damaged_record_and_all_later_records_are_computed_again(tmp_path, at)
 
 
 def test_another_question_replaces_all_later_records_of_the_journal(tmp_path):
+    """A question is the input of an evaluation, and its record has the answer."""
     ask(Journal(tmp_path / "j"), 4, [])
     journal, asked = Journal(tmp_path / "j"), []
     journal.get(b"question 0", dict)

@@ -239,6 +239,7 @@ def test_multipliers_of_the_limits_are_estimated_from_gradients():
 
 
 def test_other_hand_overs_lie_on_samples_within_the_bounds_and_a_factor_of_two():
+    """A search tries other hand-over times t_f - delta, with the same t_f."""
     some = replace(problem(2), names=("t_f", "delta"))
     bounds = normalisation.Bounds(("t_f", "delta"), (10.0, 0.9), (20.0, 5.0))
     looked = hand_overs.other_hand_overs(some, bounds, bounds.normalise(np.array([15.13, 1.5])))

@@ -38,6 +38,7 @@ def quiet():
 
 
 def test_sensitivities_of_the_peak_torque_are_its_exponents(quiet):
+    """The peak torque is proportional to eta^2 / t_f^2, so that its relative sensitivities are 2 and -2."""
     found = trust.sensitivities(
         quiet, BOUNDS, np.array([3.3, 2.0, 19.0]), ("peak_torque", "window_error", "settling_time")
     )
@@ -48,7 +49,7 @@ def test_sensitivities_of_the_peak_torque_are_its_exponents(quiet):
     assert found["window_error"]["delta"] > 0.1
 
 
-def test_an_objective_that_does_not_depend_on_a_gain_is_flat(quiet):
+def test_the_profile_of_a_gain_without_effect_on_the_objective_is_flat(quiet):
     evaluate = Evaluator(BOUNDS)
     problem = replace(quiet, objective="peak_torque")
     z = BOUNDS.normalise(np.array([3.3, 1.0, 19.0]))

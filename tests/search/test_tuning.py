@@ -484,6 +484,7 @@ def test_gains_with_the_largest_effect_on_active_limits_are_decisive_except_for_
 
 
 def test_a_problem_with_fewer_trials_keeps_added_trials_and_fractions():
+    """The fraction of trials that may break a limit, and the fraction in the tail, stay the same."""
     some = replace(problem(may_break=2, peak_torque=0.7, effort=5.0), tail=2)
     some = objective.with_trials(some, np.arange(8, 11))
     fewer = objective.fewer_trials(some, 4)

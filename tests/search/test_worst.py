@@ -183,7 +183,7 @@ MOVED = ["attitudes", "normal starts, a phase and misfits"]
 
 
 @pytest.mark.parametrize("what", short(MOVED, MOVED[1:]))
-def test_gradients_of_the_ascent_agree_with_finite_differences(what):
+def test_gradients_of_the_search_for_the_worst_case_agree_with_finite_differences(what):
     if what == "attitudes":
         problem, _ = posed(random_turns(0.4, 2.0))
         limits = {"peak_torque": 0.5, "effort": 3.0}

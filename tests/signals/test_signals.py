@@ -56,6 +56,7 @@ def test_spin_rotates_about_body_fixed_axes(rate):
 
 @pytest.mark.parametrize("rate", RATES)
 def test_spin_satisfies_the_kinematics_and_rates_of_its_vector_part_are_exact(rate):
+    """The vector part v of the quaternion has exact first and second derivatives."""
     spin, size = references.Spin(vector(START.as_quat()), vector(rate)), np.linalg.norm(rate)
     for t in TIMES:
         _, first, second, kinematics, (v_dot, v_ddot) = position_and_rates(spin, vector(t))

@@ -288,7 +288,7 @@ def test_a_run_that_never_meets_a_limit_has_a_fraction_of_0(simulated):
             assert float(share) == 0.0
 
 
-def test_knowledge_errors_are_the_measurement_noise(simulated):
+def test_pointing_knowledge_errors_without_a_filter_are_the_measurement_noise(simulated):
     ready, result = simulated
     keys = ready.parts.sensors.keys(jnp.uint32(3), jnp.uint32(5))
     samples = np.arange(50, 65)

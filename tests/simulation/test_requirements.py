@@ -155,7 +155,7 @@ def test_rounding_does_not_change_the_required_number_of_trials(trials, quantile
         assert must_keep(needed, quantile, confidence) == needed
 
 
-def test_a_fraction_is_printed_in_words():
+def test_a_verdict_on_a_fraction_of_the_trials_is_printed_in_words():
     values = np.linspace(0.1, 0.4, 1000)
     share = Requirement("peak_torque", LIMIT, None, 0.99, 0.9)
     said = "peak_torque at most 0.5 N m in 99 % of trials with 90 % confidence: worst"

@@ -291,7 +291,7 @@ def test_either_sign_of_the_initial_quaternion_gives_the_same_run():
     assert float(flipped.metrics.terminal_angle) < 1e-6
 
 
-def test_other_numbers_use_the_same_compiled_program(monkeypatch):
+def test_runs_with_other_numbers_share_a_compiled_program(monkeypatch):
     traced, loop = [], rollout._sampled_loop
 
     def counted(*args):

@@ -78,7 +78,7 @@ def test_failed_trial_counts_as_zero_in_quantiles_of_a_time_fraction():
     assert none["0.5"]["value"] == 0.0
 
 
-def test_worst_trials_by_successful_samples_have_the_fewest():
+def test_worst_trials_by_the_number_of_successful_samples_have_the_fewest():
     counts, none = np.array([65, 31, 40]), np.zeros(3, bool)
     assert campaign_summary.most_extreme("controller_ok", counts, none, 2).tolist() == [1, 2]
     assert campaign_summary.most_extreme("controller_other", counts, none, 2).tolist() == [0, 2]

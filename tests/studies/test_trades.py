@@ -232,7 +232,7 @@ def test_every_prescribed_time_has_its_own_search(monkeypatch):
     assert simulated[1:] == joined[:2]
 
 
-def test_slew_time_trade_accepts_an_observer_with_a_given_t_o():
+def test_a_front_against_t_f_accepts_an_observer_with_a_given_t_o():
     known = {"observer": {"kind": "prescribed_time", "t_o": 4.0}, "tune": {}, "loop": {"mode": "sampled"}}
     trades.SlewTime(scenario.from_tables({"controller": {"t_f": 20.0}, **known}), (20.0, 30.0)).check()
 
@@ -250,7 +250,7 @@ def test_identity_of_a_study_has_all_digits_of_its_times():
     assert listed == ["20,100.0001", "20,100.0002", "20,30"]
 
 
-def test_costs_of_a_slew_are_the_metrics_of_the_scenario():
+def test_costs_in_a_front_against_t_f_are_metrics_that_the_scenario_has():
     trials = Trials(np.arange(1), Metrics(dict.fromkeys(METRICS, np.ones(1))), np.zeros(1, int), np.zeros(1), {})
 
     def costs(**tables):

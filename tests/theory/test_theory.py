@@ -87,7 +87,7 @@ def test_boundary_layer_of_the_smallest_sign_width_is_crossed_in_one_period():
     )
 
 
-def test_exact_path_equals_the_simulated_path():
+def test_distance_to_the_singularity_along_the_exact_motion_equals_the_simulated_one():
     rate = (0.02, -0.03, 0.05)
     run = parts(30.0, 3.0, 0.05, rate=rate)
     quiet = parts(30.0, 3.0, 0.05, rate=rate, disturbance=QUIET, rate_bound=0.0)
