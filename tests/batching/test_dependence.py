@@ -10,16 +10,17 @@ TEST, ONE, OTHER = 1, 2, 4  # one bit for each of the three inputs
 
 
 def chosen(test, one, other):
-    """Both outputs depend on the test, which selects the branch."""
+    """Return outputs of a branch. Both depend on the test, which selects the branch."""
     return jax.lax.cond(test > 0.0, lambda: (one, other), lambda: (other, -other))
 
 
 def jitted(test, one, other):
+    """Return outputs of a jitted function. They do not depend on the test."""
     return jax.jit(lambda a, b: (a + b, 2.0 * b))(one, other)
 
 
 def shifted(test, one, other):
-    """The first carry depends on the second one, which depends on the rows, one step later."""
+    """Return outputs of a scan. The first carry depends on the second, which depends on the rows of a step earlier."""
 
     def step(carry, row):
         a, b = carry
@@ -30,7 +31,7 @@ def shifted(test, one, other):
 
 
 def repeated(test, one, other):
-    """All outputs depend on the test, which determines the number of steps."""
+    """Return outputs of a while loop. All depend on the test, which determines the number of steps."""
     return jax.lax.while_loop(
         lambda carry: carry[0] < test, lambda carry: (carry[0] + 1.0, 2.0 * carry[1]), (one, other)
     )
@@ -42,7 +43,7 @@ def repeated(test, one, other):
     (shifted, [TEST | ONE | OTHER, TEST | OTHER, TEST | ONE | OTHER]),
     (repeated, [TEST | ONE, TEST | ONE | OTHER]),
 ])  # fmt: skip
-def test_outputs_depend_on_their_operands_and_on_conditions(function, expected):
+def test_dependence_of_outputs_includes_operands_and_conditions(function, expected):
     closed = jax.make_jaxpr(function)(1.0, 2.0, 3.0)
     assert dependence.dependence(closed.jaxpr, [TEST, ONE, OTHER]) == expected
     assert dependence.dependence(closed.jaxpr, [0, 0, 0]) == [0] * len(expected)

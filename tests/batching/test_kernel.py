@@ -47,6 +47,7 @@ CONTINUOUS = {
 
 
 def metrics_of_trial(tables):
+    """Return a function from a trial number to the result of its simulation."""
     ready = scenario.study(scenario.from_tables(tables))
     return lambda trial: montecarlo.one(ready.parts, ready.dispersion, jnp.uint32(SEED), trial)
 
@@ -69,12 +70,13 @@ FULL_OPTIMISATION = {"xla_backend_optimization_level": 3}
 
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch):
+    """Set the block size of the kernel to 4 trials, so that six trials need two blocks."""
     monkeypatch.setattr(kernel, "BLOCK", 4)
 
 
 @pytest.fixture
 def kernels(monkeypatch):
-    """Lengths of the loops that run as a kernel."""
+    """Return a list, which receives the length of each loop that runs as a kernel."""
     lengths, scan = [], kernel.scan
 
     def recorded(params, *rest):
@@ -108,15 +110,15 @@ def check_kernel(function, tolerance, options=None):
     assert checked > 10
 
 
-@pytest.mark.long  # short test with a chain: `test_batch_with_kernel_equals_batch_without`
+@pytest.mark.long  # short test with a chain: `test_trials_simulated_with_a_kernel_equal_trials_without`
 @pytest.mark.parametrize("name", ["spacecraft", "chain", "continuous"])
-def test_interpreted_kernel_equals_scan(name, kernels):
+def test_simulation_in_an_interpreted_kernel_equals_a_scan(name, kernels):
     tables = {"spacecraft": SPACECRAFT, "chain": CHAIN, "continuous": CONTINUOUS}[name]
     check_kernel(metrics_of_trial(tables), 1e-12, FULL_OPTIMISATION)
     assert len(kernels) == 1
 
 
-def test_derivatives_along_several_directions_equal_scan(kernels):
+def test_derivatives_in_a_kernel_along_several_directions_equal_a_scan(kernels):
     """delta changes the sample times, eta a parameter of the loop, and the initial state differs by trial."""
     ready = scenario.study(scenario.from_tables({**CHAIN, "hardware": {}}))
     law = ready.parts.controller
@@ -180,7 +182,7 @@ def test_kernel_is_lowered_for_cuda_with_few_loads_and_stores(bits, make, monkey
     assert 1 <= vectors.count("swap") <= 3
 
 
-def test_batch_with_kernel_equals_batch_without():
+def test_trials_simulated_with_a_kernel_equal_trials_without():
     ready = scenario.study(scenario.from_tables(CHAIN))
     without, with_kernel = (
         montecarlo.run(ready.parts, ready.dispersion, SEED, np.arange(10), kernel=k) for k in (False, True)
@@ -202,7 +204,7 @@ def extremes(c, n):
 
 
 @pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated:DeprecationWarning")
-def test_extremes_propagate_nan(kernels, monkeypatch):
+def test_maxima_and_minima_in_a_kernel_propagate_nan(kernels, monkeypatch):
     """The maximum of NaN and 1 is 1 in Triton, but NaN in XLA."""
 
     def function(n):
@@ -264,6 +266,7 @@ def test_kernel_supports_nested_loops_branches_and_shared_values(kernels):
 
 
 def check_equal(got, expected):
+    """Assert that shapes and dtypes are equal, and numbers are equal to a relative 1e-14."""
     for (path, a), b in zip(jax.tree.leaves_with_path(got), jax.tree.leaves(expected), strict=True):
         assert (a.shape, a.dtype) == (b.shape, b.dtype)
         np.testing.assert_allclose(a, b, rtol=1e-14, err_msg=jax.tree_util.keystr(path))
@@ -314,12 +317,13 @@ def test_kernel_supports_empty_arrays(function, kernels):
     ],
     ids="short stacked backward through alike".split(),
 )
-def test_unsuitable_loops_remain_scans(function, kernels):
+def test_loops_that_are_unsuitable_for_a_kernel_run_as_scans(function, kernels):
+    """They are short or backward, stack many results, have rows that differ by trial, or are alike in all trials."""
     np.testing.assert_allclose(lanes.vmap(function, kernel=True)(NUMBERS), jax.vmap(function)(NUMBERS), rtol=1e-14)
     assert kernels == []
 
 
-def test_loop_over_no_trials_remains_a_scan(kernels):
+def test_loop_over_no_trials_runs_as_a_scan_and_not_as_a_kernel(kernels):
     function = loop(lambda c, n: 0.5 * c + n)
     check_equal(lanes.vmap(function, kernel=True)(NUMBERS[:0]), jax.vmap(function)(NUMBERS[:0]))
     assert kernels == []
@@ -340,7 +344,8 @@ def test_loop_over_no_trials_remains_a_scan(kernels):
     ids="switch choice known carried constant".split(),
 )
 @pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated:DeprecationWarning")
-def test_constructs_that_triton_needs_in_another_form(step, kernels, monkeypatch):
+def test_kernel_replaces_constructs_that_triton_lacks(step, kernels, monkeypatch):
+    """They are switch, selection among three values, and nested loops with known or constant carries."""
     function = loop(step)
     check_equal(jax.jit(lanes.vmap(function, kernel=True))(NUMBERS), jax.jit(jax.vmap(function))(NUMBERS))
     assert "triton" in lower_for_cuda(function, NUMBERS, monkeypatch)[1]
@@ -363,7 +368,7 @@ def test_constructs_that_triton_needs_in_another_form(step, kernels, monkeypatch
     ],
     ids="while stacked backward erf inverse callback type key sort large".split(),
 )
-def test_unsupported_loops_warn_and_run_as_scans(step, message, kernels, monkeypatch):
+def test_loops_that_a_kernel_does_not_support_warn_and_run_as_scans(step, message, kernels, monkeypatch):
     monkeypatch.setattr(configure, "devices", gpus)  # an interpreted kernel would support erf
     function = loop(step)
     with pytest.warns(lanes.LanesWarning, match=f"step by step, which may be slow: .*{message}"):

@@ -25,6 +25,7 @@ def draw(*shape, low=-2.0, high=2.0, seed=0, trials=TRIALS):
 
 
 def integers(*shape, low=-9, high=10, dtype: Any = jnp.int64, seed=0):
+    """Return random integers (TRIALS, *shape)."""
     return jnp.asarray(np.random.default_rng([seed, *shape]).integers(low, high, (TRIALS, *shape)), dtype)
 
 
@@ -59,6 +60,7 @@ def in_loop(function):
 
 
 def check(function, *args, in_axes: Any = 0):
+    """Assert that `lanes.vmap` and `jax.vmap` of a function have equal results."""
     mapped = lanes.vmap(function, in_axes), jax.vmap(function, in_axes)
     agree(*jax.jit(lambda *args: [one(*args) for one in mapped])(*args))  # one program compiles faster than two
 
@@ -194,10 +196,13 @@ CONTRACTIONS: dict[str, tuple] = {
 
 
 def rotating(x, m, length=7, **options):
+    """Multiply a vector by a matrix in each step of a scan; return the last vector and rows of all steps."""
     return scan(lambda x, k: (jnp.tanh(m @ x) + 0.1 * k, (x, x[0], k)), x, jnp.arange(length), **options)
 
 
 def scans_of_rows(x, rows):
+    """Scan over the rows of a table, with a number and a counter as carry."""
+
     def step(carry, row):
         total, count = carry
         return (total + row["a"] * jnp.sin(total), count + 1), {
@@ -210,6 +215,8 @@ def scans_of_rows(x, rows):
 
 
 def nested(x, m):
+    """Run a scan in each step of a scan."""
+
     def outer(x, k):
         inner, ys = scan(lambda y, j: (y + 0.1 * jnp.cos(x) * j, y @ x), x, jnp.arange(3))
         return jnp.sin(m @ inner) + k, ys.sum()
@@ -218,13 +225,13 @@ def nested(x, m):
 
 
 def late(s):
-    """Carries that depend on each other in a chain: the last one depends on the trial from the fourth step on."""
+    """Scan with carries that depend on each other in a chain. The last one depends on the trial from step 4 on."""
     one = jnp.ones(())
     return scan(lambda c, k: ((s, c[0], c[1] * 2, c[2] + k, c[4] + 1), c), (one, one, one, one, 0), jnp.arange(8))
 
 
 def time_and_state(s):
-    """The time does not depend on the trial, but the state does."""
+    """Scan with a time, which does not depend on the trial, and a state, which does."""
 
     def step(carry, _):
         t, x = carry
@@ -234,33 +241,39 @@ def time_and_state(s):
 
 
 def late_in_call(x):
-    """The dependence on the trial passes through a jitted function and a checkpoint."""
+    """Scan with a dependence on the trial that passes through a jitted function and a checkpoint."""
     double = jax.jit(lambda a, b: (a * 2, b + 1))
     halve = jax.checkpoint(lambda a: jnp.sin(a) / 2)
     return scan(lambda c, _: (double(*(halve(c[0]), c[1])), c), (x, jnp.zeros(3)), None, 3)
 
 
 def swap(x):
+    """Exchange a carry that differs by trial with a constant carry in each step of a scan."""
     return scan(lambda c, _: ((c[1], c[0]), c), (x, FIXED), None, 3)
 
 
 def used_in_a_loop_and_after(x, m):
+    """Use the same matrix in a loop and after it."""
     x = fori_loop(0, 3, lambda k, x: jnp.tanh(m @ x), x)
     return m @ x
 
 
 def made_used_in_a_loop_and_after(x, y):
+    """Use the same computed value in a loop and after it."""
     made = x * y  # computed as components, but sort needs the array
     total = fori_loop(0, 3, lambda k, t: t + jnp.sort(made), x)
     return total, jnp.sort(made) * made
 
 
 def used_in_two_loops(x, m):
+    """Use the same matrix in two loops, one after the other."""
     x = fori_loop(0, 3, lambda k, x: jnp.tanh(m @ x), x)
     return fori_loop(0, 2, lambda k, x: jnp.sin(m @ x), x)
 
 
 def used_in_an_inner_loop_and_after(x, m):
+    """Use the same matrix in an inner loop and after it, in each step of a scan."""
+
     def outer(x, _):
         x = fori_loop(0, 2, lambda k, x: jnp.tanh(m @ x), x)
         return m @ x, x
@@ -324,16 +337,19 @@ BRANCHES: dict[str, tuple] = {
 
 @jax.custom_jvp
 def cubed(x):
+    """Return x^3, with the custom derivative of `_cubed_jvp`."""
     return x**3
 
 
 @cubed.defjvp
 def _cubed_jvp(primals, tangents):
+    """Return x^3 and a wrong tangent, 100 x dx."""
     return cubed(*primals), 100.0 * tangents[0] * primals[0]  # a wrong derivative on purpose, to detect its use
 
 
 @jax.custom_vjp
 def squared(x):
+    """Return x^2, with a wrong custom gradient, 50 x."""
     return x * x
 
 
@@ -411,7 +427,7 @@ WITHOUT_RULE = {
 
 @cache
 def mapped(group):
-    """Return the results of lanes and `jax.vmap` for each row of a group; one program compiles faster than many."""
+    """Return the results of lanes and `jax.vmap` for all functions of a group, computed in one compiled program."""
     rows = {name: row for name, row in CASES.items() if name.startswith(f"{group}: ")}
 
     @jax.jit
@@ -436,6 +452,7 @@ def test_lanes_vmap_equals_jax_vmap(name):
 
 
 def is_floating(tree):
+    """Return whether all leaves of a pytree are floating-point numbers."""
     return all(jnp.issubdtype(jnp.result_type(leaf), jnp.floating) for leaf in jax.tree.leaves(tree))
 
 
@@ -471,6 +488,7 @@ SHARED_LONG = (
 
 
 def is_short(name, shared):
+    """Return whether a function of the table is in the short tests of derivatives."""
     group, _, row = name.partition(": ")
     is_included = not shared or (group in ("loops", "branches", "contractions") and row not in SHARED_LONG)
     return is_included and row in SHORT_ROWS.get(group, (row,))
@@ -510,7 +528,10 @@ def jvp_by_lanes_and_jax(name, shared):
 
 @cache
 def tangents(group, shared, short_rows):
-    """Return the tangents of the short or the other rows of a group, by name, from one program."""
+    """Return the tangents by lanes and by JAX for functions of a group, by name, from one program.
+
+    short_rows: whether they are the functions of the short tests or the others.
+    """
     names = [name for name in CASES if name.startswith(f"{group}: ") and is_short(name, shared) == short_rows]
     names = [name for name in names if (name, shared) in JVP_CASES]
     cases = {name: jvp_by_lanes_and_jax(name, shared) for name in names}

@@ -54,15 +54,18 @@ ARGS = (X, M, S)
 
 
 def loss(vmap, x, m, s, function=law):
+    """Return a scalar of the batched results, for derivatives."""
     end, peaks = vmap(function)(x, m, s)
     return jnp.sqrt(jnp.mean(end**2)) + jnp.mean(peaks)
 
 
 def derivative_along_cosines(vmap, *args):
+    """Return the batched results and their tangents along the cosines of the arguments."""
     return jax.jvp(vmap(law), args, tuple(jnp.cos(a) for a in args))
 
 
 def gradients(vmap, *args):
+    """Return the gradients of `loss` by all three arguments."""
     return jax.grad(partial(loss, vmap), argnums=(0, 1, 2))(*args)
 
 
@@ -96,7 +99,7 @@ OUTSIDE = {
 
 @pytest.mark.filterwarnings("ignore::ptsmc_jax.batching.lanes.LanesWarning")
 @pytest.mark.parametrize("name", OUTSIDE)
-def test_lanes_compose_with_outer_transformations(name):
+def test_lanes_vmap_equals_jax_vmap_inside_other_transformations(name):
     got, expected = (jax.jit(partial(OUTSIDE[name], vmap))(*ARGS) for vmap in (lanes.vmap, jax.vmap))
     agree(got, expected)
 
@@ -108,7 +111,7 @@ def test_lanes_work_without_jit():
     )
 
 
-def test_custom_derivatives_are_preserved():
+def test_lanes_vmap_uses_custom_derivatives():
     derivative = jax.jvp(lanes.vmap(cubed), (X,), (jnp.ones_like(X),))[1]
     np.testing.assert_allclose(derivative, 100 * X, rtol=1e-15)
 
@@ -136,15 +139,15 @@ ROWS = [
 
 @pytest.mark.filterwarnings("ignore::ptsmc_jax.batching.lanes.LanesWarning")
 @pytest.mark.parametrize(("function", "args", "in_axes"), [row[1:] for row in ROWS], ids=[row[0] for row in ROWS])
-def test_mapped_and_shared_arguments_equal_jax_vmap(function, args, in_axes):
+def test_lanes_with_mapped_and_shared_arguments_equal_jax_vmap(function, args, in_axes):
     check(function, *args, in_axes=in_axes)
 
 
-def test_default_in_axes_map_all_arguments():
+def test_lanes_map_all_arguments_by_default():
     agree(lanes.vmap(jnp.multiply)(X, Y), X * Y)
 
 
-def test_in_axes_may_be_a_named_tuple():
+def test_in_axes_of_lanes_may_be_a_named_tuple():
     state = AttitudeState(Q, FIXED)
     check(lambda x: x.q[:3] * x.w, state, in_axes=(AttitudeState(0, None),))  # pyright: ignore[reportArgumentType]
 
@@ -172,12 +175,12 @@ ERRORS = [
 
 
 @pytest.mark.parametrize(("args", "in_axes"), [row[1:] for row in ERRORS], ids=[row[0] for row in ERRORS])
-def test_invalid_in_axes_raise(args, in_axes):
+def test_invalid_in_axes_of_lanes_raise_an_error(args, in_axes):
     with pytest.raises(ValueError):  # noqa: PT011
         lanes.vmap(lambda *a: a, in_axes)(*args)
 
 
-def test_error_message_names_the_invalid_value():
+def test_errors_of_lanes_name_the_invalid_axis_or_numbers_of_trials():
     with pytest.raises(ValueError, match=r"one number of trials, found \[3, 5\]"):
         lanes.vmap(jnp.multiply)(X, Y[:3])
     with pytest.raises(ValueError, match="0 and None only, found 1"):
@@ -194,7 +197,7 @@ def test_error_message_names_the_invalid_value():
     ],
     ids=["none", "too many", "without direction axis", "fewer trials"],
 )
-def test_directions_of_the_wrong_shape_raise(directions, message):
+def test_directions_of_lanes_jvp_with_a_wrong_shape_raise_an_error(directions, message):
     """Regression: a vector was treated as several directions of a scalar."""
     with pytest.raises(ValueError, match=message):
         lanes.jvp(lambda x: x**2)((X,), directions)
@@ -204,6 +207,7 @@ def test_directions_of_the_wrong_shape_raise(directions, message):
 
 
 def shapes_in_loops(jaxpr, inside=False):
+    """Yield the shapes of all values that are computed in the loops of a jaxpr."""
     for eqn in jaxpr.eqns:
         loop = inside or eqn.primitive.name == "scan"
         if inside:
@@ -212,18 +216,20 @@ def shapes_in_loops(jaxpr, inside=False):
             yield from shapes_in_loops(inner, loop)
 
 
-def test_loops_carry_vectors_over_the_trials():
+def test_loops_in_lanes_carry_vectors_over_the_trials():
+    """Lanes split the state into components. Each is an array (TRIALS,)."""
     traced = jax.make_jaxpr(lanes.vmap(lambda x, m, s: law(x, m, s)[0]))(*ARGS)
     assert set(shapes_in_loops(traced.jaxpr)) == {(), (TRIALS,)}
 
 
 def time_and_state_in_a_call(s):
+    """Scan with a jitted step of a time, which does not depend on the trial, and a state, which does."""
     step = jax.jit(lambda t, x: (t + 0.1, x + jnp.exp(-t) * x))
     return lax.scan(lambda c, _: (step(*c), c), (0.0, s), None, 6)
 
 
 @pytest.mark.parametrize("run", [time_and_state, time_and_state_in_a_call])
-def test_values_that_do_not_depend_on_the_trial_are_computed_once(run):
+def test_lanes_compute_values_that_do_not_depend_on_the_trial_once(run):
     traced = jax.make_jaxpr(lanes.vmap(run))(S)
     (scan,) = [eqn for eqn in traced.jaxpr.eqns if eqn.primitive.name == "scan"]
     exponentials = [eqn for eqn in scan.params["jaxpr"].jaxpr.eqns if eqn.primitive.name == "exp"]
@@ -232,7 +238,9 @@ def test_values_that_do_not_depend_on_the_trial_are_computed_once(run):
     assert (times.shape, states.shape) == ((TRIALS, 6), (TRIALS, 6))
 
 
-def test_branch_on_the_time_remains_a_branch():
+def test_lanes_keep_a_branch_whose_condition_all_trials_share():
+    """A condition that differs by trial becomes a selection between the results of both branches."""
+
     def run(s):
         step = lambda c, k: lax.cond(k > 3, lambda: jnp.exp(c), lambda: c)  # noqa: E731
         return lax.scan(lambda c, k: (step(c, k), None), s, jnp.arange(6))[0]
@@ -246,7 +254,7 @@ def test_branch_on_the_time_remains_a_branch():
     assert not [eqn for eqn in selected if eqn.primitive.name == "cond"]
 
 
-def test_while_loop_with_a_shared_condition_tests_a_scalar():
+def test_lanes_test_a_scalar_in_a_while_loop_whose_condition_all_trials_share():
     def run(s):
         return lax.while_loop(lambda c: c[0] < 3, lambda c: (c[0] + 1, jnp.sin(c[1])), (0, s))
 
@@ -254,7 +262,8 @@ def test_while_loop_with_a_shared_condition_tests_a_scalar():
     assert sorted(v.aval.shape for v in loop.outvars) == [(), (TRIALS,)]
 
 
-def test_custom_derivatives_are_evaluated_on_components():
+def test_lanes_evaluate_custom_derivatives_on_components():
+    """Each multiplication of the derivative has the shape (TRIALS,)."""
     traced = jax.make_jaxpr(lambda x: jax.jvp(lanes.vmap(in_loop(cubed)), (x,), (x,)))(X)
     shapes = {v.aval.shape for eqn in equations(traced) for v in eqn.outvars if eqn.primitive.name == "mul"}
     assert shapes == {(TRIALS,)}
@@ -262,16 +271,18 @@ def test_custom_derivatives_are_evaluated_on_components():
 
 @jax.custom_jvp
 def scaled(n, x):
+    """Return n x^2, with the custom derivative of `_scaled_jvp`."""
     return n * x**2
 
 
 @scaled.defjvp
 def _scaled_jvp(primals, tangents):
+    """Return n x^2 and a wrong tangent, 7 n dx."""
     return scaled(*primals), 7.0 * primals[0] * tangents[1]  # a wrong derivative on purpose, to detect its use
 
 
 @pytest.mark.parametrize("in_axes", [(0, 0), (None, 0), (0, None)])
-def test_custom_derivatives_with_integer_arguments_are_preserved(in_axes):
+def test_lanes_vmap_uses_custom_derivatives_with_integer_arguments(in_axes):
     n, x = (jnp.arange(TRIALS), jnp.arange(TRIALS) * 0.5)
     n, x = (v if axis == 0 else v[3] for v, axis in zip((n, x), in_axes, strict=True))
     got, expected = (
@@ -281,34 +292,34 @@ def test_custom_derivatives_with_integer_arguments_are_preserved(in_axes):
     agree(got, expected)
 
 
-def test_large_carry_is_not_split_into_components():
+def test_lanes_do_not_split_a_large_carry_into_components():
     big = draw(70)
     traced = jax.make_jaxpr(lanes.vmap(lambda t: lax.scan(lambda c, _: (2 * c, None), t, None, 3)[0]))(big)
     (loop,) = [eqn for eqn in equations(traced) if eqn.primitive.name == "scan"]
     assert [v.aval.shape for v in loop.outvars] == [(TRIALS, 70)]
 
 
-def test_warnings_name_the_primitive_and_the_source_line():
+def test_warnings_of_lanes_name_the_primitive_and_the_source_line():
     matrices = jnp.stack([jnp.eye(3), 2 * jnp.eye(3)])
     message = r"`cholesky` \(.*test_lanes_outside\.py:\d+\): jax.vmap evaluates it, which may be slow"
     with pytest.warns(lanes.LanesWarning, match=message):
         lanes.vmap(in_loop(lambda m: lax.linalg.cholesky(m)))(matrices)
 
 
-def test_small_contractions_outside_loops_are_sums_of_products():
+def test_lanes_replace_small_contractions_outside_loops_by_sums_of_products():
     """XLA aborts the process for some batches of contractions, for example of derivatives."""
     traced = jax.make_jaxpr(lanes.vmap(lambda m, x: m @ (m @ x)))(draw(3, 3), X)
     assert not [eqn for eqn in equations(traced) if eqn.primitive.name == "dot_general"]
 
 
-def test_large_arrays_are_not_split_into_components():
+def test_lanes_do_not_split_large_arrays_into_components():
     function = lanes.vmap(in_loop(lambda t: 2 * t + 1))
     few, many = (len(list(equations(jax.make_jaxpr(function)(draw(n))))) for n in (65, 64))
     assert few < 10
     assert many >= 2 * 64
 
 
-def test_integer_and_boolean_outputs_have_float0_tangents():
+def test_integer_and_boolean_outputs_of_lanes_jvp_have_float0_tangents():
     """Regression: NumPy arrays of float0 raised an error in a comparison."""
 
     def function(x):
@@ -322,7 +333,7 @@ def test_integer_and_boolean_outputs_have_float0_tangents():
 
 
 @pytest.mark.parametrize("values", [jnp.array([-1.0, 0.0, 4.0]), jnp.array([[-1.0, -0.0], [1.0, 4.0], [0.0, 2.0]])])
-def test_reverse_mode_ignores_branches_that_a_trial_does_not_take(values):
+def test_reverse_mode_of_lanes_ignores_branches_that_a_trial_does_not_take(values):
     """Regression: an infinite derivative of the other branch times zero gave NaN."""
 
     def root(v, factor):

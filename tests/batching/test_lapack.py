@@ -91,7 +91,7 @@ class EighReference(ptsmc.Reference):
 
 @pytest.fixture
 def batched_calls(monkeypatch):
-    """Batched calls of the primitives in `NEVER_BATCHED` in any trace."""
+    """Return a list, which receives the batched calls of the primitives in `NEVER_BATCHED` of any trace."""
     calls = []
     for p in (p for p in vars(core.primitives).values() if getattr(p, "name", None) in lapack.NEVER_BATCHED):
 

@@ -21,11 +21,13 @@ from tests.helpers import SHORT, SHORT_CHAIN, same, short, untuned
 
 
 def of_scenario(tables, seed):
+    """Return the campaign of a scenario's tables with this seed."""
     return campaign.Campaign(scenario.study(scenario.from_tables(tables)), seed)
 
 
 @pytest.fixture(scope="module")
 def simulated():
+    """Return the campaign of a short integrator chain and the rows of its first 300 trials."""
     made = of_scenario(untuned(SHORT_CHAIN), 3)
     return made, made.simulate(range(300))
 
@@ -95,7 +97,8 @@ def test_failed_trials_do_not_affect_the_others():
         np.testing.assert_array_equal(got[known], good[name].to_numpy()[known], err_msg=name)
 
 
-def test_missing_parts_of_a_campaign():
+def test_missing_parts_of_a_campaign_are_found_and_divided_among_shards():
+    """A part is a file with the rows of successive trials."""
     part, nowhere = rows.Part, Path()
     full = campaign.PART
     assert campaign.missing_parts([], 10) == [(0, 10)]
@@ -111,7 +114,7 @@ def test_missing_parts_of_a_campaign():
     assert [len(shard) for shard in shards] == [3, 2, 2]
 
 
-def test_parts_are_written_one_after_the_other(simulated, tmp_path, monkeypatch):
+def test_parts_of_a_campaign_are_written_and_reported_one_after_the_other(simulated, tmp_path, monkeypatch):
     made, frame = simulated
     monkeypatch.setattr(campaign, "PART", 100)
     kept = rows.Rows(tmp_path / "trials", b"k")
@@ -126,7 +129,9 @@ def test_parts_are_written_one_after_the_other(simulated, tmp_path, monkeypatch)
 
 
 @pytest.mark.parametrize("together", short([2, 3, 16], [3]))
-def test_parts_simulated_in_one_call_are_the_same(simulated, tmp_path, monkeypatch, together):
+def test_parts_of_a_campaign_that_are_simulated_in_one_call_have_the_same_rows(
+    simulated, tmp_path, monkeypatch, together
+):
     """Accelerators simulate several parts of a shard together. They are not adjacent, and the last one is shorter."""
     made, frame = simulated
     monkeypatch.setattr(campaign, "PART", 40)
@@ -148,7 +153,7 @@ def test_parts_simulated_in_one_call_are_the_same(simulated, tmp_path, monkeypat
         same(rows.read([part]), frame[part.first : part.end])
 
 
-def test_finished_parts_remain_if_a_later_part_fails(simulated, tmp_path, monkeypatch):
+def test_finished_parts_of_a_campaign_remain_if_a_later_part_fails(simulated, tmp_path, monkeypatch):
     made, _ = simulated
     monkeypatch.setattr(campaign, "PART", 100)
     kept = rows.Rows(tmp_path / "trials", b"k")
@@ -167,7 +172,7 @@ def test_finished_parts_remain_if_a_later_part_fails(simulated, tmp_path, monkey
     assert [part.first for part in kept.parts()[0]] == [0, 100]
 
 
-def test_failures_are_counted_in_the_progress(simulated, tmp_path):
+def test_failed_trials_are_counted_in_the_progress_of_a_campaign(simulated, tmp_path):
     _, frame = simulated
     kept = rows.Rows(tmp_path / "trials", b"k")
     worse = frame.with_columns(
@@ -178,6 +183,7 @@ def test_failures_are_counted_in_the_progress(simulated, tmp_path):
 
 
 def overshoot(result, parts):
+    """Return custom metrics: the largest error after t_f, and the number of rows of the history."""
     error = jnp.sqrt(jnp.sum(result.log.error**2, axis=-1))
     late = result.log.t > parts.controller.t_f
     return {"overshoot": jnp.max(jnp.where(late, error, 0.0)), "rows": jnp.sum(result.log.has_length)}
@@ -226,7 +232,7 @@ def test_invalid_custom_metrics_are_refused(simulated, made_of, said):
         replace(simulated[0], custom_metrics=made_of).custom_metric_names()
 
 
-def test_histories_equal_those_of_single_runs(simulated):
+def test_error_histories_of_a_campaign_equal_single_runs(simulated):
     made, _ = simulated
     t, error = campaign.error_history(made, np.array([3, 250], dtype=np.uint32))
     for k, trial in enumerate((3, 250)):
@@ -236,7 +242,7 @@ def test_histories_equal_those_of_single_runs(simulated):
 
 
 @pytest.mark.parametrize("kind", [np.float64, np.float32])
-def test_missing_values_are_null_in_both_precisions(monkeypatch, kind):
+def test_metrics_that_are_nan_are_null_in_the_rows_in_both_precisions(monkeypatch, kind):
     made = of_scenario(tomllib.loads(SHORT_CHAIN), 3)
     simulated = montecarlo.run(made.ready.parts, made.ready.dispersion, 3, np.arange(montecarlo.FEW))
     lacking = Metrics({**simulated.metrics, "settling_time": np.full(montecarlo.FEW, np.nan)})
@@ -253,7 +259,7 @@ def test_missing_values_are_null_in_both_precisions(monkeypatch, kind):
 @pytest.mark.parametrize(("varies", "rows", "simulated"), [
     (True, (), [0, 1, 2, 3]), (False, (), [None]), (True, (7, 9), [7, 9]), (False, (7,), [7]),
 ])  # fmt: skip
-def test_lower_bound_is_pooled_over_the_first_trials_or_rows(monkeypatch, varies, rows, simulated):
+def test_lower_bound_of_a_campaign_is_pooled_over_its_first_trials_or_rows(monkeypatch, varies, rows, simulated):
     """Trial k has the lower bound k + 1. The second simulated trial fails and has no bound."""
     seen: list[Any] = []
 

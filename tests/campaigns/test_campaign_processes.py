@@ -22,10 +22,12 @@ SLOW = SHORT_CHAIN.replace("t_f = 5.0", "t_f = 15.0").replace("t_end = 6.5", "t_
 
 
 def environment():
+    """Return the environment of a process that imports this source tree and compiles quickly."""
     return dict(os.environ, PYTHONPATH=str(ROOT), XLA_FLAGS=f"{os.environ.get('XLA_FLAGS', '')} {QUICKLY}")
 
 
 def started(folder, *options, **others):
+    """Start `ptsmc montecarlo` with these options in a folder, and return the process."""
     return subprocess.Popen([*PTSMC, *COMMAND, *options], cwd=folder, env=environment(), text=True,
                             stdout=subprocess.PIPE, stderr=subprocess.PIPE, **others)  # fmt: skip
 
@@ -37,6 +39,7 @@ def ended(run, seconds=300):
 
 
 def parts(folder):
+    """Return the names of the campaign's files of rows."""
     return sorted(path.name for path in (folder / RESULTS / "trials").glob("*.parquet"))
 
 
@@ -73,6 +76,7 @@ def whole(tmp_path_factory):
 
 @pytest.fixture
 def folder(tmp_path):
+    """Return a new folder with the scenario s.toml, whose simulation is slow enough for a kill."""
     (tmp_path / "s.toml").write_text(SLOW)
     return tmp_path
 

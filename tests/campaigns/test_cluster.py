@@ -13,7 +13,7 @@ from ptsmc_jax.campaigns.store import RefusedError
 
 
 class FakeClient:
-    """Runs submitted functions immediately, and records its own options."""
+    """A fake client of Dask, which runs submitted functions immediately and records its own options."""
 
     loop = None
 
@@ -22,6 +22,7 @@ class FakeClient:
         FakeClient.made = self
 
     def submit(self, function, *arguments, **_):
+        """Run the function and return a finished future."""
         future = Future()
         try:
             future.set_result(function(*arguments))
@@ -30,20 +31,23 @@ class FakeClient:
         return future
 
     def cancel(self, futures):
+        """Record the cancelled futures."""
         self.cancelled = futures
 
     def close(self):
+        """Record that the client is closed."""
         self.closed = True
 
 
 @pytest.fixture(autouse=True)
 def _dask(monkeypatch):
+    """Replace the client of Dask by `FakeClient`."""
     monkeypatch.setattr(distributed, "Client", FakeClient)
     monkeypatch.setattr(distributed, "as_completed", lambda futures, **_: iter(futures))
 
 
 def simulated_by(monkeypatch, tmp_path, receipt):
-    """Return a folder whose parts are simulated by a worker that returns this result."""
+    """Return a fake campaign whose cluster workers answer with `receipt(first trial, number of trials)`."""
     monkeypatch.setattr(cluster, "_simulate_part", lambda recipe, first, count: receipt(first, count))
     return SimpleNamespace(recipe=lambda: (None, "x"), rows=Rows(tmp_path, b"k"))
 
@@ -68,7 +72,7 @@ def test_a_local_cluster_listens_on_the_loopback_only(monkeypatch):
     assert (asked["host"], asked["n_workers"], asked["threads_per_worker"]) == ("127.0.0.1", 3, 1)
 
 
-def test_results_of_workers_become_parts(monkeypatch, tmp_path):
+def test_results_of_cluster_workers_become_parts_of_the_campaign(monkeypatch, tmp_path):
     here = store.packages()
     (tmp_path / "p.parquet").write_bytes(b"")
     folder = simulated_by(monkeypatch, tmp_path, lambda first, count: (first, count, "p.parquet", 7, here))
@@ -85,7 +89,7 @@ def test_results_of_workers_become_parts(monkeypatch, tmp_path):
         (ValueError("no\nroom"), "a worker of the cluster failed: no room"),
     ],
 )
-def test_results_of_other_versions_or_failed_workers_are_refused(monkeypatch, tmp_path, change, said):
+def test_cluster_workers_that_failed_or_have_other_versions_are_refused(monkeypatch, tmp_path, change, said):
     def receipt(first, count):
         if isinstance(change, Exception):
             raise change

@@ -15,6 +15,7 @@ SEMICOLONS = "x1;x2\n1,5;-0,25\n1e-3;0,02\n"
 
 
 def numbers(table):
+    """Return the columns x1 and x2 as numbers (rows, 2)."""
     return table.select("x1", "x2").cast(pl.Float64).to_numpy()
 
 
@@ -42,12 +43,12 @@ def numbers(table):
     ],
 )
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
-def test_an_unambiguous_table_is_read(tmp_path, written, encoding):
+def test_an_unambiguous_csv_table_is_read(tmp_path, written, encoding):
     (tmp_path / "table.csv").write_bytes(written.encode(encoding))
     np.testing.assert_array_equal(numbers(csv_tables.read(tmp_path / "table.csv")), NUMBERS)
 
 
-def test_an_empty_cell_is_null(tmp_path):
+def test_an_empty_cell_of_a_csv_table_is_null(tmp_path):
     (tmp_path / "table.csv").write_text("x1,x2\n1.0,\n")
     assert csv_tables.read(tmp_path / "table.csv")["x2"].to_list() == [None]
 
@@ -71,7 +72,7 @@ def test_an_empty_cell_is_null(tmp_path):
         (PLAIN.encode("utf-16")[:-1], "not text in UTF-8"),
     ],
 )
-def test_another_table_is_refused_with_the_cause(tmp_path, written, cause):
+def test_an_ambiguous_or_invalid_csv_table_is_refused_with_the_cause(tmp_path, written, cause):
     (tmp_path / "table.csv").write_bytes(written)
     with refuses(RefusedError, cause):
         run_tables.read(tmp_path / "table.csv")

@@ -13,7 +13,7 @@ from tests.helpers import ROOT, SHORT_CHAIN, tree
 
 
 def refused(folder, **options):
-    """Whether the folder is in use."""
+    """Return whether the folder cannot be locked, because another writer uses it."""
     try:
         with store.lock_folder(folder, **options):
             return False
@@ -23,7 +23,7 @@ def refused(folder, **options):
 
 @pytest.mark.parametrize("first", [False, True])
 @pytest.mark.parametrize("second", [False, True])
-def test_folder_has_one_exclusive_writer_or_several_shared_writers(tmp_path, first, second):
+def test_a_result_folder_has_one_exclusive_writer_or_several_shared_writers(tmp_path, first, second):
     folder = tmp_path / "new" / "out"
     with store.lock_folder(folder, shared=first):
         assert refused(folder, shared=second) is not (first and second)
@@ -140,7 +140,7 @@ def test_commands_do_not_write_into_a_folder_in_use(command, tmp_path, asked):
 
 
 @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="the system has no /proc")
-def test_a_folder_that_takes_no_files_is_not_in_use():
+def test_a_folder_that_cannot_be_written_is_not_reported_as_in_use():
     """No file can be created in /proc, although its permissions allow it."""
     with (
         pytest.raises(store.RefusedError, match="nothing may be written into /proc;"),

@@ -55,6 +55,7 @@ def test_invalid_margin_requirements_are_refused(changes, said):
 
 
 def test_every_margin_can_be_required():
+    """The computed margins have the names of the catalogue of required margins."""
     some = margins.Margins(*(jnp.ones(2) for _ in range(5)), stable=jnp.ones(2, bool), crossover=jnp.ones(2))
     assert tuple(some.worst()) == tuple(catalogues.MARGINS)
 
@@ -74,6 +75,7 @@ def test_worst_margins_are_the_smallest_and_the_largest_peak_sensitivity(xp):
     ("value", "met", "over"), [(6.0, True, 1.0), (5.9, False, 1.0 + 0.1 / 6), (np.inf, True, 0.0), (-3.0, False, 2.5)]
 )
 def test_verdict_on_a_margin_with_a_lower_limit(value, met, over, tmp_path):
+    """The verdict has the violation ratio. It is read back from JSON, also with an infinite margin."""
     verdict = Requirement("gain_margin", 6.0, "dB", at_least=True).verdict(np.asarray(value), np.asarray(True))
     assert verdict.met == met
     np.testing.assert_allclose(verdict.margin, over, rtol=1e-12)
@@ -104,7 +106,7 @@ def test_verdict_on_many_loops_uses_the_smallest_margin():
         ({"actuator_scale": {"kind": "relative_normal"}}, True),
     ],
 )
-def test_loops_differ_if_a_dispersion_affects_them(dispersion, differ):
+def test_trials_have_different_loops_if_a_dispersion_affects_the_linearised_loop(dispersion, differ):
     made = scenario.from_tables({**BODY, "dispersion": dispersion})
     assert margin_verdicts.has_different_loops(scenario.study(made).dispersion) == differ
 
@@ -115,6 +117,7 @@ JUDGED = run_margins.TIMES + 1  # number of loops of one trial
 
 @pytest.fixture(scope="module", autouse=True)
 def _few_loops():
+    """Set small numbers of trials and of loops per call for all tests of the module."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(margin_verdicts, "TRIALS", TRIALS)
         patch.setattr(margin_verdicts, "LOOPS_PER_CALL", 2)
@@ -151,7 +154,7 @@ def worst_of(each):
 
 
 def sloped(asked, bounds, normalised):
-    """Return the constraints and their gradients at one point."""
+    """Return the constraints on margins and their gradients at one point of normalised gains."""
     return {
         name: v[0]
         for name, v in margin_rows.constraints_at_points(asked, bounds.scale, np.asarray(normalised)[None]).items()
@@ -159,6 +162,7 @@ def sloped(asked, bounds, normalised):
 
 
 def farthest(name, values, axis):
+    """Return the worst value of a margin along an axis, the largest peak sensitivity or the smallest other margin."""
     return (np.max if name == "peak_sensitivity" else np.min)(np.asarray(values), axis=axis)
 
 
@@ -168,6 +172,7 @@ class Lag(ptsmc.Draw):
     count = 1
 
     def at(self, c, parts):
+        """Return the parts with another torque lag."""
         lag = parts.actuators.lag * (1.0 + 0.3 * c[0])
         return dataclasses.replace(parts, actuators=dataclasses.replace(parts.actuators, lag=lag))
 
@@ -211,7 +216,10 @@ def posed_of(plant):
 
 @pytest.fixture(scope="module", params=short(DRAWN, ["chain"]))
 def drawn(request):
-    """A tuning problem with six loops, whose two hardest are constraints. The chain compiles faster."""
+    """Return a tuning problem with six trials. The margins of the two hardest trials are constraints.
+
+    The chain compiles faster.
+    """
     return posed_of(request.param)
 
 
@@ -377,7 +385,7 @@ def changed(posed, factors):
 
 @pytest.mark.parametrize(("factors", "late"), short(LOOKED, LOOKED[-1:]))
 def test_worst_margins_are_exact_without_exact_margins_of_all_loops(drawn, factors, late, monkeypatch):
-    """The result equals that of exact margins of all loops. Interpolation errors are less than half of `OFF`."""
+    """The result equals that of exact margins of all loops. Interpolation errors are below half of `ASSUMED_ERROR`."""
     posed = drawn
     parts, dispersion = changed(posed, factors), posed.ready.dispersion
     every = all_of(parts, dispersion, 3, late)
@@ -420,7 +428,7 @@ def test_worst_margins_are_exact_without_exact_margins_of_all_loops(drawn, facto
 
 
 class _Told(NamedTuple):
-    """Loops, represented by their numbers."""
+    """Fake loops, which only have a number and a period."""
 
     number: Any
     period: Any

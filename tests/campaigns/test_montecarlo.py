@@ -23,12 +23,13 @@ FIRST = scenario.replace(scenario.read(FIRST_FLIGHT), controller__delta=0.5, loo
 
 @pytest.fixture(scope="module")
 def chain():
-    """The distribution of trials over devices and blocks does not depend on the plant."""
+    """Return the study of an integrator chain. Trials are distributed over devices and blocks for any plant alike."""
     return scenario.study(scenario.from_tables(untuned(SHORT_CHAIN)))
 
 
 @pytest.fixture(scope="module")
 def simulated(chain):
+    """Return the results of the first 256 trials of the chain."""
     return montecarlo.run(chain.parts, chain.dispersion, 5, np.arange(256))
 
 
@@ -91,7 +92,7 @@ def test_a_trial_does_not_depend_on_the_others(chain, simulated):
 
 
 @pytest.mark.parametrize(("eta", "delta", "gain", "quiet", "noisy"), short(TABLE, TABLE[::4]))
-def test_errors_and_torques_agree_with_the_theory_notes(eta, delta, gain, quiet, noisy):
+def test_rms_errors_and_peak_torques_agree_with_the_theory_notes(eta, delta, gain, quiet, noisy):
     gains = {"controller__eta": eta, "controller__delta": delta, "observer__gain": [gain] * 3}
     base = scenario.replace(FIRST, **gains)
     silent = scenario.replace(base, hardware={"attitude_noise": 0.0, "rate_noise": 0.0})

@@ -13,15 +13,17 @@ KEY = rows.campaign_key({"loop": {"period": 0.1}}, {"seed": 1})
 
 
 def frame(first, count):
+    """Return rows of `count` successive trials."""
     return pl.DataFrame({"trial": np.arange(first, first + count, dtype=np.uint32), "x": np.arange(count) / 7.0})
 
 
 @pytest.fixture
 def kept(tmp_path):
+    """Return the store of a campaign's rows in a new folder."""
     return rows.Rows(tmp_path / "trials", KEY)
 
 
-def test_parts_are_read_in_order(kept):
+def test_part_files_of_a_campaign_are_read_in_the_order_of_their_trials(kept):
     for first in (100, 0, 50):
         kept.write(first, frame(first, 50))
     parts, broken = kept.parts()
@@ -33,7 +35,7 @@ def test_parts_are_read_in_order(kept):
 
 
 @pytest.mark.parametrize("harm", ["flip", "cut", "empty", "renamed", "foreign", "longer"])
-def test_damaged_part_is_detected(kept, harm):
+def test_damaged_part_file_of_a_campaign_is_detected(kept, harm):
     whole, harmed = kept.write(0, frame(0, 50)), kept.write(50, frame(50, 50))
     content = bytearray(harmed.path.read_bytes())
     if harm == "flip":
@@ -51,7 +53,7 @@ def test_damaged_part_is_detected(kept, harm):
     assert len(broken) == 1
 
 
-def test_a_part_is_read_once_until_it_changes(kept, monkeypatch):
+def test_a_part_file_of_a_campaign_is_read_once_until_it_changes(kept, monkeypatch):
     part = kept.write(0, frame(0, 50))
     os.utime(part.path, (1e9, 1e9))
     content, read, reads = part.path.read_bytes(), Path.read_bytes, []
@@ -64,7 +66,7 @@ def test_a_part_is_read_once_until_it_changes(kept, monkeypatch):
     assert kept.parts() == kept.parts() == ([], [part.path])
 
 
-def test_longer_part_replaces_a_shorter_one(kept):
+def test_longer_part_file_replaces_a_shorter_one_with_the_same_first_trial(kept):
     short, long = kept.write(0, frame(0, 20)), kept.write(0, frame(0, 50))
     after = kept.write(50, frame(50, 10))
     assert kept.parts()[0] == [long, after]
@@ -73,7 +75,7 @@ def test_longer_part_replaces_a_shorter_one(kept):
     assert kept.parts()[0] == [long, after]
 
 
-def test_temporary_files_of_a_killed_process_are_ignored_and_removed(kept):
+def test_temporary_files_among_the_part_files_are_ignored_and_removed(kept):
     kept.write(0, frame(0, 20))
     (kept.folder / ".making-xyz").write_bytes(b"half")
     assert len(kept.parts()[0]) == 1
@@ -81,7 +83,7 @@ def test_temporary_files_of_a_killed_process_are_ignored_and_removed(kept):
     assert [path.name[0] for path in kept.folder.iterdir()] == ["0"]
 
 
-def test_file_of_the_user_among_the_parts_is_kept(kept):
+def test_file_of_the_user_among_the_part_files_is_not_deleted(kept):
     kept.write(0, frame(0, 20))
     mine = kept.folder / "mine.parquet"
     frame(0, 5).write_parquet(mine)
@@ -89,7 +91,7 @@ def test_file_of_the_user_among_the_parts_is_kept(kept):
     assert mine.exists()
 
 
-def test_part_that_does_not_fit_on_the_disk_leaves_no_file(kept, monkeypatch):
+def test_part_file_that_does_not_fit_on_the_disk_is_removed(kept, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
@@ -105,12 +107,12 @@ def test_different_campaigns_have_different_keys():
     assert len({rows.campaign_key(*o) for o in others} | {rows.campaign_key({"a": {"b": 1}}, {"seed": 1})}) == 4
 
 
-def test_a_key_is_the_same_in_every_process():
+def test_the_key_of_a_campaign_is_the_same_in_every_process():
     """A process can read the parts of another process."""
     assert KEY.hex() == "79ec63fbf7446be36358bada73ee7bbd0088b974470097e1ab1365364697ff48"
 
 
-def test_trials_of_overlapping_parts_are_read_once(kept):
+def test_trials_of_overlapping_part_files_are_read_once(kept):
     long, _, after = kept.write(0, frame(0, 50)), kept.write(20, frame(20, 20)), kept.write(50, frame(50, 10))
     assert kept.parts() == ([long, after], [])
     assert rows.read(kept.parts()[0])["trial"].to_list() == list(range(60))
@@ -118,6 +120,7 @@ def test_trials_of_overlapping_parts_are_read_once(kept):
 
 @pytest.mark.parametrize("name", ["runs[1]", "runs*", "runs?"])
 def test_folder_with_wildcards_in_its_name_is_read_alone(tmp_path, name):
+    """Rows of the folder `runs1` are not read with those of `runs*`."""
     for folder in (name, "runs1"):
         kept = rows.Rows(tmp_path / folder, KEY)
         kept.write(0, frame(0, 50).with_columns(status=pl.lit("ok" if folder == name else "diverged")))

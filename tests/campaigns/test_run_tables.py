@@ -63,6 +63,7 @@ dispersion = { x0 = { kind = "normal" }, state_noise = { kind = "relative_normal
 
 
 def ready(text):
+    """Return the study of a scenario in TOML."""
     return scenario.study(scenario.from_tables(tomllib.loads(text)))
 
 
@@ -81,6 +82,7 @@ def of_a_chain():
 
 
 def of_run_table(made, table):
+    """Return the campaign with the trials of a run table."""
     return campaign.from_run_table(made.ready, made.seed, run_tables.check_table(table, made.ready.parts))
 
 
@@ -144,7 +146,7 @@ def test_custom_dispersion_is_not_applied_twice_to_a_run_table():
     assert set(other.run_table.given) == {"initial_state"}
 
 
-def test_other_values_of_a_custom_dispersion_are_refused():
+def test_other_values_of_a_custom_dispersion_in_a_run_table_are_refused():
     """Earlier, other values in the run table were ignored."""
     known = scenario.from_tables({"plant": {"kind": "chain"}, "loop": {"mode": "sampled"}})
     ready = scenario.study(ptsmc.replace(known, dispersion={"custom": {"kind": "custom", "code": Farther}}))
@@ -182,7 +184,7 @@ def corners(everything):
 
 
 def stands(given, table):
-    """Check that the rows have the values of the run table."""
+    """Assert that rows have the values of the run table `table`."""
     assert given["run_trial"].to_list() == [5, 9]
     assert given["run_seed"].to_list() == [SEED, 11]
     for name in set(table.columns) - {"trial", "seed"}:  # quaternions come normalised
@@ -269,7 +271,7 @@ def made_of_a_run():
     return ("trial", "run_trial", "run_seed", "status", "reason", "bad_time", *catalogues.CATALOGUES["spacecraft"])
 
 
-def test_quantities_that_a_row_omits_are_random():
+def test_quantities_that_a_run_table_omits_are_random():
     made = campaign.Campaign(ready(CHAIN), SEED)
     run_table = made.draw(range(2))
     states = pl.DataFrame({f"initial_x{k}": [0.1 * k, -0.1] for k in (1, 2, 3)})
@@ -286,6 +288,7 @@ FILTER = '[filter]\nkind = "steady_state"\n'
 
 @pytest.mark.parametrize("text", [EVERYTHING + FILTER, CHAIN], ids=["spacecraft", "chain"])
 def test_quantities_are_read_as_written_and_do_not_change_the_controller(text):
+    """A quantity is written into the parts, such as a dispersed inertia, and read from them again."""
     parts = ready(text).parts
     generator = np.random.default_rng(2)
     there = {name: quantity.columns(parts) for name, quantity in QUANTITIES.items()}
@@ -302,10 +305,11 @@ def test_quantities_are_read_as_written_and_do_not_change_the_controller(text):
 
 
 def onboard(parts):
+    """Return the flight software of the parts: controller, observer and attitude filter."""
     return parts.controller, parts.observer, getattr(parts.sensors, "filter", None)
 
 
-def test_dispersions_do_not_change_the_controller():
+def test_dispersions_do_not_change_the_flight_software():
     whole, drawn = ready(EVERYTHING + FILTER), []
     jax.eval_shape(lambda k: drawn.append(whole.dispersion.apply(whole.parts, 3, k)), jnp.uint32(0))
     assert onboard(whole.parts)[2] is not None
@@ -369,7 +373,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("columns", "said"), BAD, ids=[row[1][:50] for row in BAD])
-def test_invalid_values_are_refused_with_row_and_column(everything, columns, said):
+def test_invalid_values_of_a_run_table_are_refused_with_row_and_column(everything, columns, said):
     with refuses(RefusedError, said):
         run_tables.check_table(pl.DataFrame(columns, strict=False), everything[0].ready.parts)
 
@@ -411,21 +415,22 @@ MISFIT = [
 
 @pytest.fixture(scope="module")
 def misfit():
-    """The parts of a spacecraft with wheels, an attitude filter and a mode."""
+    """Return the parts of a spacecraft with wheels, an attitude filter and a flexible mode."""
     return ready(HARDWARE).parts
 
 
 def table_of(columns, rows):
+    """Return a run table of numbers with these columns and rows."""
     return pl.DataFrame(rows, schema=dict.fromkeys(columns, pl.Float64), orient="row")
 
 
 @pytest.mark.parametrize(("columns", "rows", "said"), MISFIT, ids=[row[2][-60:] for row in MISFIT])
-def test_impossible_hardware_is_refused_with_row_and_column(misfit, columns, rows, said):
+def test_impossible_hardware_errors_of_a_run_table_are_refused_with_row_and_column(misfit, columns, rows, said):
     with refuses(RefusedError, said):
         run_tables.check_table(table_of(columns, rows), misfit)
 
 
-def test_limiting_cases_of_hardware_are_accepted(misfit):
+def test_limiting_cases_of_hardware_errors_in_a_run_table_are_accepted(misfit):
     """Outages of zero length, wheel 0 (no failure), the last wheel, and a coupling that needs the row's inertia."""
     heavy = (20.0, 0.0, 0.0, 20.0, 0.0, 20.0)
     rows = [(-1.0, -1.0, 2.0, 0.0, 4.0, 0.0, 0.0, *heavy), (3.0, 3.0, 2.0, 4.0, 0.0, 0.0, 4.4, *heavy)]
@@ -433,7 +438,7 @@ def test_limiting_cases_of_hardware_are_accepted(misfit):
     assert [list(values[1]) for values in run_table.given.values()] == [[3, 3], [2, 4], [0, 0, 4.4], list(heavy)]
 
 
-def test_inconsistent_initial_angle_is_refused(everything):
+def test_initial_angle_that_contradicts_the_initial_attitude_of_a_run_table_is_refused(everything):
     made, run_table = everything
     wrong = pl.when(pl.col("trial") == 2).then(3.0).otherwise("initial_angle")
     with pytest.raises(RefusedError, match="has initial_angle 3 in row 2, but must have "):

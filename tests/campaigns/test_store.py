@@ -96,7 +96,7 @@ def test_result_without_a_summary_replaces_an_earlier_result(tmp_path, changed):
 TOLD = {"command": "tune", "seed": 5}
 
 
-def test_earlier_result_needs_the_same_scenario_seed_and_command(tmp_path):
+def test_earlier_result_is_found_only_for_the_same_scenario_seed_and_command(tmp_path):
     tables, folder = {"controller": {"eta": 3.0, "gain": [1.0, 2.0]}}, tmp_path / "out"
     finished(folder, tables)
     assert store.read_previous_summary(folder, tables, TOLD) == {"status": "met"}
@@ -126,6 +126,7 @@ def test_unfinished_run_is_found_only_for_the_same_list_of_sensors(tmp_path):
 
 
 def fill(folder):
+    """Write a figure and a summary into a folder."""
     (folder / "figures").mkdir()
     (folder / "figures" / "a.png").write_text("new")
     (folder / "summary.json").write_text("new")
@@ -181,7 +182,7 @@ def test_folder_is_written_if_its_parent_is_not_writable(tmp_path, monkeypatch):
         store.check_folder(tmp_path / "new", force=False)
 
 
-def test_failed_write_keeps_the_existing_file(tmp_path):
+def test_failed_write_of_a_file_keeps_the_existing_file(tmp_path):
     def rows():
         yield [1.0]
         raise OSError(28, "No space left on device")
@@ -219,7 +220,7 @@ def test_run_that_cannot_begin_on_a_full_disk_leaves_no_files(tmp_path, monkeypa
 
 
 @pytest.mark.parametrize("stop", [RuntimeError, KeyboardInterrupt, OSError])
-def test_interrupted_write_changes_nothing(tmp_path, stop):
+def test_interrupted_write_of_a_result_folder_changes_nothing(tmp_path, stop):
     def stopped(folder):
         fill(folder)
         raise stop
@@ -233,7 +234,7 @@ def test_interrupted_write_changes_nothing(tmp_path, stop):
     assert [p.name for p in tmp_path.iterdir()] == ["old"]
 
 
-def test_new_and_empty_folders_are_allowed_and_others_with_force(tmp_path):
+def test_results_are_allowed_in_new_and_empty_folders_and_with_force_in_others(tmp_path):
     """The command tests check the sentences of refused folders."""
     (tmp_path / "empty").mkdir()
     for name in ("new", "empty"):
@@ -287,7 +288,7 @@ def test_toml_tables_are_read_back_exactly(tmp_path_factory, tables):
     assert json.dumps(read, sort_keys=True) == json.dumps(tables, sort_keys=True)
 
 
-def test_a_scenario_file_has_the_unit_of_each_number(tmp_path):
+def test_a_written_scenario_file_has_the_units_of_its_numbers_in_comments(tmp_path):
     tracker = {"kind": "star_tracker", "noise_across": "8 arcsec", "noise_about": "40 arcsec"}
     raw = {
         "disturbance": {"kind": "sum", "terms": [{"kind": "constant"}, {"kind": "random_walk"}]},
@@ -311,6 +312,7 @@ def test_a_scenario_file_has_the_unit_of_each_number(tmp_path):
 
 
 def finished(folder, tables):
+    """Create the result folder of a finished search with this scenario."""
     folder.mkdir()
     store.write_toml(folder / "scenario.toml", tables)
     store.write_json(folder / "versions.json", store.versions("tune", 5))
@@ -341,6 +343,7 @@ def test_versions_describe_command_code_and_platform(monkeypatch):
 
 
 def test_unfinished_run_resumes_only_with_the_same_command(tmp_path):
+    """Seed, scenario and versions must be the same, too. The command line may differ."""
     tables, folder = {"controller": {"eta": 3.0}}, tmp_path / "new"
     assert not store.has_unfinished_run(folder, tables, TOLD)
     journal = store.begin_run(folder, tables, TOLD, fresh=True)

@@ -18,7 +18,7 @@ from tuning.studies import campaign_folder, campaign_summary
 
 
 class Rows:
-    """A campaign of 401 trials whose torque depends on the random initial angle."""
+    """A fake campaign of 401 trials with a random initial attitude. The test replaces the reading of its rows."""
 
     custom_metric_names = ()
     scenario = scenarios.from_tables({"dispersion": {"attitude": {"kind": "uniform"}}})
@@ -28,6 +28,7 @@ class Rows:
     units = campaign_folder.Folder.units
 
     def intact_parts(self):
+        """Return the only file of rows."""
         return [self]
 
 
@@ -92,7 +93,7 @@ def test_inputs_of_the_worst_trial_have_percentile_median_and_sensitivity(monkey
     assert statistics.distinct_inputs({"a": angle, "b": -angle, "c": rate}) == ["a", "c"]
 
 
-def test_every_random_input_may_be_a_reason(monkeypatch):
+def test_every_random_input_may_explain_the_worst_trials(monkeypatch):
     """Columns are in alphabetical order. Earlier, columns before the initial angle (the inertia) were left out."""
     drawn = {"attitude": {"kind": "uniform"}, "inertia": {"kind": "relative_normal", "std": 0.1},
              "disturbance_phase": {"kind": "uniform"}}  # fmt: skip
@@ -114,7 +115,7 @@ def test_every_random_input_may_be_a_reason(monkeypatch):
     assert inspect.unwrap(campaign_summary.input_columns)(folder, [None]) == columns
 
 
-def test_dispersion_of_zero_width_is_not_a_reason():
+def test_dispersion_of_zero_width_does_not_explain_a_metric():
     """Angles with a dispersion from 100 to 100 deg differ by rounding errors of the quaternion only."""
     random = np.random.default_rng(3)
     angle = np.deg2rad(100.0) + 2.2e-16 * random.integers(-2, 3, 401)
