@@ -65,7 +65,8 @@ def pytest_collection_modifyitems(items):
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _shapes_are_checked_where_a_thing_is_tested_by_itself(request):
+def _check_shapes_outside_callers(request):
+    """Check the annotated array shapes at run time, except in the folders of `CALLERS`."""
     jaxtyping.config.update("jaxtyping_disable", request.path.parent.name in CALLERS)
 
 
@@ -82,8 +83,14 @@ def _room_for_compiled_programs():
 
 
 @pytest.fixture
+def small_parts(monkeypatch):
+    """Store the rows of a campaign in files of 100 trials, so that short campaigns have several files."""
+    monkeypatch.setattr("ptsmc_jax.campaigns.campaign.PART", 100)
+
+
+@pytest.fixture
 def command(request, tmp_path, monkeypatch, capsys):
-    """Run `ptsmc ...` in a folder with s.toml only; return exit status, stdout and stderr.
+    """Return a function that runs `ptsmc ...` in a folder with s.toml only, and returns exit status, stdout and stderr.
 
     The scenario s.toml is `SCENARIO` of the test module, or `SHORT`.
     """

@@ -41,7 +41,7 @@ def test_an_ephemeris_of_a_chain_is_refused(command, tmp_path):
     assert "--aem" in refused(command, tmp_path, "simulate", "s.toml", "--aem")
 
 
-def test_a_missing_file_is_a_configuration_error(command, tmp_path):
+def test_a_missing_file_of_the_reference_is_a_configuration_error(command, tmp_path):
     (tmp_path / "s.toml").write_text(FOLLOWING)
     assert "reference.file" in refused(command, tmp_path, "simulate", "s.toml")
 

@@ -16,6 +16,7 @@ from tests.output.pages import checked
 from tuning.output import formats, progress
 from tuning.studies import campaign_summary
 
+pytestmark = pytest.mark.usefixtures("small_parts")
 SCENARIO, FOLDER = SHORT_CHAIN, "out/montecarlo-s"
 MANY = 70  # number of trials, large enough for the compiled program of many trials
 OVERSHOOT = """
@@ -29,18 +30,14 @@ nothing = 3
 """
 
 
-@pytest.fixture(autouse=True)
-def _small_parts(monkeypatch):
-    monkeypatch.setattr(campaign, "PART", 100)
-
-
 def summary(folder):
+    """Return the content of summary.json in a folder."""
     return json.loads((folder / "summary.json").read_text())
 
 
 @pytest.fixture
 def simulated(command, tmp_path):
-    """A campaign of 250 trials that meets its requirement."""
+    """Return the folder of a campaign of 250 trials that meets its requirement."""
     assert command("montecarlo", "s.toml", "--trials", 250, "--seed", 3, "--no-figures", "--quiet") == (0, "", "")
     return tmp_path / FOLDER
 
@@ -92,7 +89,7 @@ def test_montecarlo_writes_rows_summary_and_figures(command, tmp_path, monkeypat
 
 @pytest.mark.parametrize(("drawn", "instead"), short([(r"\[0.5, 0.1\]", "[0, 0]"), ("x0 = {.*", "")],
                                                      [(r"\[0.5, 0.1\]", "[0, 0]")]))  # fmt: skip
-def test_equal_trials_are_reported(command, tmp_path, simulated, drawn, instead):
+def test_trials_with_equal_metrics_cause_a_warning(command, tmp_path, simulated, drawn, instead):
     """The scenario has no dispersion, or one of zero width, which compiled programs of other tests can simulate."""
     assert not [said for said in summary(simulated)["warnings"] if "the same metrics: neither" in said]
     text = re.sub(drawn, instead, SHORT_CHAIN).replace("[2e-5, 1e-5]", "[0, 0]")
@@ -101,7 +98,7 @@ def test_equal_trials_are_reported(command, tmp_path, simulated, drawn, instead)
     assert "WARNING: all 250 trials have the same metrics: neither" in said
 
 
-def test_failed_trials_are_not_reported_as_equal():
+def test_failed_trials_without_metrics_cause_no_warning_of_equal_metrics():
     assert campaign_summary._equal_trials({"window_error": {"without_value": 5}}, 5) == []
     at_rest = {"window_error": {"without_value": 0, "mean": 0.0, "max": 0.0}}
     (said,) = campaign_summary._equal_trials(at_rest, 5)
@@ -124,7 +121,7 @@ def test_more_trials_extend_an_existing_campaign(command, simulated, tmp_path):
 
 
 @pytest.mark.parametrize("from_table", [False, True])
-def test_repeated_part_is_not_counted_twice_in_the_progress(command, monkeypatch, from_table):
+def test_trials_that_are_simulated_again_are_not_counted_twice_in_the_progress(command, monkeypatch, from_table):
     standing = []
     monkeypatch.setattr(progress.CampaignProgress, "__call__", lambda _, tally: standing.append(replace(tally)))
     for trials in (10, 20):
@@ -188,7 +185,7 @@ def test_another_campaign_in_the_same_folder_is_refused(command, simulated, tmp_
         (["--metrics", "m.py:no"], "--metrics is m.py:no: m.py has no such name; allowed is"),
     ],
 )
-def test_invalid_options_print_one_line_and_write_nothing(command, tmp_path, options, said):
+def test_invalid_options_of_montecarlo_print_one_line_and_write_nothing(command, tmp_path, options, said):
     (tmp_path / "m.py").write_text(OVERSHOOT)
     line = refused(command, tmp_path, "montecarlo", "s.toml", *options)
     assert line.startswith("ptsmc: ")
@@ -314,7 +311,7 @@ def test_a_shard_does_not_delete_the_rows_of_other_shards(command, tmp_path):
     assert command("montecarlo", "s.toml", *options, "--shard", "1/1", "--force") == (0, "", "")
 
 
-def test_damaged_part_is_reported_and_simulated_again(command, simulated, tmp_path):
+def test_damaged_part_of_a_campaign_is_reported_and_simulated_again(command, simulated, tmp_path):
     whole = rows_of(simulated)
     part = sorted((simulated / "trials").iterdir())[1]
     part.write_bytes(part.read_bytes()[:-100])
@@ -329,7 +326,7 @@ def test_damaged_part_is_reported_and_simulated_again(command, simulated, tmp_pa
     assert part.with_name(part.name + ".damaged").exists()  # damaged files are renamed, not deleted
 
 
-def test_a_changed_scenario_is_not_reported_as_damaged_trials(command, simulated, tmp_path):
+def test_a_scenario_that_changed_after_the_campaign_is_reported_as_changed(command, simulated, tmp_path):
     scenario = simulated / "scenario.toml"
     written = scenario.read_text()
     scenario.write_text(written.replace("\nt_end = ", "\nt_end = 1"))
@@ -439,7 +436,7 @@ def lost(monkeypatch):
     return lambda: monkeypatch.setattr(montecarlo, "run", run)
 
 
-def test_failures_are_counted_with_reason_and_time(command, tmp_path, lost):
+def test_failed_trials_are_counted_with_reason_and_time(command, tmp_path, lost):
     lost()
     code, said, _ = command("montecarlo", "s.toml", "--trials", 250)
     found = summary(tmp_path / FOLDER)

@@ -79,7 +79,7 @@ def test_simulate_writes_its_result_folder(command, tmp_path):
 
 # `test_interrupted_search_writes_its_best_gains_and_resumes` tunes a chain
 @pytest.mark.parametrize("text", short([SHORT_CHAIN, SHORT], [SHORT]), ids=["chain", "spacecraft"])
-def test_tune_command_writes_results_and_repeats_them(command, tmp_path, monkeypatch, text):
+def test_tune_command_writes_its_results_and_a_second_call_shows_them(command, tmp_path, monkeypatch, text):
     small_search(monkeypatch)
     (tmp_path / "s.toml").write_text(text)
     status, _, _ = command("tune", "s.toml", "--out", "t")
@@ -246,7 +246,7 @@ NUMBERS = {
     ],
     ids=lambda part: " ".join(part),
 )
-def test_invalid_input_prints_one_line_and_writes_nothing(command, tmp_path, args, named):
+def test_invalid_arguments_and_files_print_one_line_and_write_nothing(command, tmp_path, args, named):
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "mine").write_text("keep")
     (tmp_path / "broken.toml").write_text("x = ")
@@ -258,7 +258,8 @@ def test_invalid_input_prints_one_line_and_writes_nothing(command, tmp_path, arg
     assert all(part in line for part in named)
 
 
-def rows_of(folder):
+def history_of(folder):
+    """Return the numbers of trajectory.csv (rows, columns)."""
     return np.loadtxt(folder / "trajectory.csv", delimiter=",", skiprows=1)
 
 
@@ -267,7 +268,7 @@ def test_simulate_without_a_file_runs_case_one_of_the_paper(command, tmp_path):
     folder = tmp_path / "out" / "simulate-default"
     assert set(tree(folder)) == {"trajectory.csv", "summary.json", "scenario.toml", "versions.json"}
     assert scenario.read(folder / "scenario.toml") == scenario.from_tables({})
-    rows = rows_of(folder)
+    rows = history_of(folder)
     # At rest, v' = 0, so that s = t_f v' + eta v = eta v. The torque is u = -2 eta^2 J v / (q4 t_f^2), theory.md 3.3.
     # The tolerance allows rounding errors.
     v, q4 = PAPER_ATTITUDE[:3], PAPER_ATTITUDE[3]
@@ -297,15 +298,15 @@ def test_empty_scenario_file_is_reported_as_case_one_of_the_paper(command, tmp_p
 def test_last_row_of_the_history_is_at_t_end(command, tmp_path, timing):
     (tmp_path / "s.toml").write_text(SHORT.replace("t_end = 6.5", timing))
     assert command("simulate", "s.toml", "--quiet", "--no-figures")[0] == 0
-    rows = rows_of(tmp_path / "out" / "simulate-s")
+    rows = history_of(tmp_path / "out" / "simulate-s")
     assert (rows[0, 0], rows[-1, 0]) == (0.0, float(timing.split("t_end = ")[1]))
     assert np.all(np.diff(rows[:, 0]) > 0)
 
 
-def test_seed_and_trial_select_a_run(command, tmp_path):
+def test_seed_and_trial_select_initial_state_and_noise_of_a_run(command, tmp_path):
     def fly(name, *options):
         assert command("simulate", "s.toml", "--out", name, "--quiet", "--no-figures", *options) == (0, "", "")
-        return rows_of(tmp_path / name)
+        return history_of(tmp_path / name)
 
     nominal, zero, three = fly("a"), fly("b", "--trial", 0), fly("c", "--trial", 3, "--seed", 4294967295)
     np.testing.assert_array_equal(fly("d", "--trial", 3, "--seed", 4294967295), three)
@@ -316,7 +317,7 @@ def test_seed_and_trial_select_a_run(command, tmp_path):
     assert np.any(fly("g", "--seed", 1)[-1] != nominal[-1])  # other noise
 
 
-def test_failed_run_is_reported(command, tmp_path):
+def test_simulate_reports_status_reason_and_time_of_a_failed_run(command, tmp_path):
     # with attitude noise of 10 rad, the law cannot avoid its singularity
     text = SHORT.replace("attitude_noise = 2e-5", "attitude_noise = 10.0")
     (tmp_path / "s.toml").write_text(text.replace("window = 1.0", "window = 1.0\nsettling_angle = 1e-3"))
@@ -463,7 +464,7 @@ for args in {HELP}:
     assert rest == ""
 
 
-def test_exit_statuses_of_a_process(tmp_path):
+def test_exit_status_is_1_for_a_violated_requirement_and_2_for_a_configuration_error(tmp_path):
     (tmp_path / "s.toml").write_text(SHORT_CHAIN.replace("peak_torque = 3.0", "peak_torque = 0.01"))
     run = ("simulate", tmp_path / "s.toml", "--out", tmp_path / "out", "--quiet", "--no-figures")
     # a user may set these variables to debug custom code; they must not stop a run with a NaN metric

@@ -65,13 +65,13 @@ def test_all_representations_are_the_same_attitude(sequence):
     (("--rotvec-deg", "-90,0,0"), "90 degrees about [-1, 0, 0]"),
     (("--dcm-body-to-inertial", "-1 0 0 0 -1 0 0 0 1"), "180 degrees about [0, 0, 1]"),
 ])  # fmt: skip
-def test_command_accepts_every_representation(command, options, angle):
+def test_convert_attitude_accepts_every_representation(command, options, angle):
     code, said, error = command("convert-attitude", *options)
     assert (code, error) == (0, "")
     assert f"# {angle}\n" in said
 
 
-def test_gimbal_lock_is_reported(command):
+def test_convert_attitude_reports_gimbal_lock(command):
     code, said, error = command("convert-attitude", "--euler-deg", "10,90,20")
     assert (code, error) == (0, "")
     assert "gimbal lock" in said
@@ -93,7 +93,7 @@ def test_gimbal_lock_is_reported(command):
     (("--euler-deg", "1,2,3", "--sequence", ""), '--sequence is "", but must be three axes'),
     (("--mrp", "0,0,0", "--sequence", "abc"), "--sequence is abc, but must be three axes"),
 ])  # fmt: skip
-def test_invalid_attitudes_are_refused(command, tmp_path, options, said):
+def test_convert_attitude_refuses_invalid_attitudes(command, tmp_path, options, said):
     assert refused(command, tmp_path, "convert-attitude", *options).startswith(f"ptsmc: {said}")
 
 

@@ -16,7 +16,7 @@ SCENARIO, CONTINUOUS = SHORT_CHAIN, SHORT.replace('"sampled"', '"continuous"').s
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
-    """The folder of an exported controller of s.toml."""
+    """Return the folder of a controller that is exported from s.toml."""
     place = tmp_path_factory.mktemp("exported")
     (place / "s.toml").write_text(SHORT_CHAIN)
     return folder.export(place / "s.toml", place / "c", trials=1)
@@ -61,7 +61,7 @@ def test_simulate_runs_the_exported_controller(command, tmp_path, exported):
 
 
 @needs_compiler
-def test_parameters_that_differ_in_the_controller_are_reported(command, tmp_path, exported):
+def test_parameters_of_an_exported_controller_that_differ_from_the_scenario_are_reported(command, tmp_path, exported):
     (tmp_path / "s.toml").write_text(SHORT_CHAIN.replace("[controller]", "[controller]\neta = 2.9\nk1 = 0.8"))
     status, _, err = command("simulate", "s.toml", "--controller", exported, "--no-figures", "--quiet")
     said = (

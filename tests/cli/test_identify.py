@@ -32,13 +32,13 @@ prior = "none"
 
 @pytest.fixture
 def logged(command, tmp_path):
-    """A scenario whose input has 0.8 of the torque that the log's plant has, and the log."""
+    """Return a folder with a scenario, and a log of a plant with 1.25 times the scenario's actuator torque."""
     (tmp_path / "true.toml").write_text(SCENARIO.replace("[hardware]", "[hardware]\nactuator_scale = [1.25]"))
     assert command("simulate", "true.toml", "--out", "run", "--no-figures", "--quiet")[0] == 0
     return tmp_path
 
 
-def test_a_simulated_run_gives_its_parameters_and_a_page(command, logged):
+def test_identify_finds_the_parameters_of_a_simulated_run_and_writes_its_files(command, logged):
     log = "run/trajectory.csv"
     status, out, err = command("identify", "s.toml", log, "--validate", log, "--out", "found")
     assert status == 0, err
@@ -70,7 +70,7 @@ def test_a_simulated_run_gives_its_parameters_and_a_page(command, logged):
 
 
 @pytest.mark.long
-def test_a_replayed_trial_gives_its_parameters(command, logged):
+def test_identify_finds_the_parameters_of_a_replayed_trial(command, logged):
     text = (logged / "true.toml").read_text() + "[dispersion]\nx0 = { kind = 'uniform', half_width = [0.2, 0.1] }\n"
     (logged / "true.toml").write_text(text)
     assert command("montecarlo", "true.toml", "--trials", 2, "--out", "campaign", "--no-figures", "--quiet")[0] == 0
@@ -80,7 +80,7 @@ def test_a_replayed_trial_gives_its_parameters(command, logged):
     assert abs(scale["estimate"] - 1.25) < 3.5 * scale["std"] < 0.02
 
 
-def test_a_doubtful_result_names_dispersed_parameters_that_are_not_free(command, logged):
+def test_identify_names_dispersed_parameters_that_are_not_free_if_the_model_does_not_fit(command, logged):
     """The log has 1.25 times the torque of the scenario, and no free parameter explains it."""
     text = SCENARIO.replace('["actuator_scale", "disturbance_bias"]', '["disturbance_bias"]')
     (logged / "few.toml").write_text(text + '[dispersion]\nactuator_scale = { kind = "relative_normal", std = 0.2 }\n')
@@ -89,7 +89,7 @@ def test_a_doubtful_result_names_dispersed_parameters_that_are_not_free(command,
     assert "free actuator_scale, which [dispersion] varies" in out
 
 
-def test_a_constant_that_may_stand_for_a_slow_sinusoid_is_named(command, logged):
+def test_identify_names_a_constant_torque_that_the_log_does_not_tell_from_a_slow_sinusoid(command, logged):
     """Regression: the identified scenario had the disturbance twice, as a sinusoid and as a constant."""
     slow = 'kind = "sinusoid"\namplitude = [0.01]\nfrequency = [1e-4]\nphase = [1.5]'
     (logged / "slow.toml").write_text(SCENARIO.replace('kind = "none"', slow))
@@ -98,7 +98,7 @@ def test_a_constant_that_may_stand_for_a_slow_sinusoid_is_named(command, logged)
     assert "the data do not tell disturbance_bias from the sinusoid of [disturbance]" in out
 
 
-def test_a_design_has_a_profile_within_the_limits(command, logged):
+def test_a_designed_manoeuvre_has_a_profile_within_the_limits(command, logged):
     options = "--design", "--duration", "0.1 min", "--rate", "500 mrad/s"
     status, out, err = command("identify", "s.toml", *options, "--out", "plan")
     assert status == 0, err
@@ -137,7 +137,7 @@ def test_a_design_names_parameters_that_are_known_better_than_the_manoeuvre_can_
         (["twice.csv"], "twice.csv has t 0.5 in row 6, but must have a time after that of row 5, 0.5"),
     ],
 )
-def test_wrong_options_and_files_are_refused_and_nothing_is_written(command, tmp_path, options, words):
+def test_identify_refuses_wrong_options_and_files_and_writes_nothing(command, tmp_path, options, words):
     rows = [f"{0.1 * min(k, 5 + k // 7):.1f},1,0,0" for k in range(20)]
     (tmp_path / "twice.csv").write_text("\n".join(["t,measured_x1,measured_x2,sent1", *rows]))
     assert words in refused(command, tmp_path, "identify", "s.toml", *options)

@@ -69,14 +69,14 @@ LOADED = scenario.from_tables(tomllib.loads(SHORT_CHAIN))
 
 @pytest.fixture(autouse=True)
 def shown(monkeypatch):
-    """The summaries whose reports are printed."""
+    """Replace the printed reports by empty ones, and return the list of summaries that they would show."""
     summaries = []
     monkeypatch.setattr(reports, "build", lambda command, summary, plant: summaries.append(summary) or EMPTY)
     return summaries
 
 
 def search_of(status, write, command="tune"):
-    """Return a search that ends with this status; `write` fills its folder."""
+    """Return a fake search that ends with this status; `write` fills its folder."""
     made_by = {"command": command, "seed": 0}
     return searches.LongSearch(made_by, "window error", lambda *_: SimpleNamespace(status=status), write)
 

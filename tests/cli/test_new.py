@@ -42,6 +42,7 @@ def test_schema_command_does_not_overwrite_its_file(command, tmp_path):
 
 
 def test_new_does_not_need_docstrings():
+    """The option -OO of Python removes docstrings."""
     call = [sys.executable, "-OO", "-c", "from tuning.cli import new; print(new.scenario_text('chain', {}), end='')"]
     done = subprocess.run(call, capture_output=True, text=True, cwd=ROOT, check=False)
     assert (tomllib.loads(done.stdout), done.stderr) == (tomllib.loads(new.scenario_text("chain", {})), "")
@@ -78,7 +79,7 @@ def test_keys_of_custom_classes_keep_their_order_and_are_quoted():
 
 
 @pytest.mark.parametrize("plant", layouts.TABLES)
-def test_every_key_of_the_plant_is_written_with_its_meaning(plant):
+def test_new_writes_every_key_of_the_plant_with_its_meaning(plant):
     text = new.scenario_text(plant, {})
     found = blocks(text)
     names = list(layouts.TABLES[plant])
@@ -128,7 +129,7 @@ def test_new_like_a_list_of_sensors_writes_the_same_sensors():
     assert [table["kind"] for table in tomllib.loads(text)["sensors"]] == ["gyro", "star_tracker", "star_tracker"]
 
 
-def test_commented_sensors_are_valid_together():
+def test_commented_sensors_of_a_new_scenario_are_valid_together():
     groups = kinds(blocks(new.scenario_text(None, {}))["[sensors]"])
     for excluded in ({"rotvec_deg", "rate_noise"}, {"boresight", "rate_noise_density"}):
         sensors = [{key: v for key, v in values(lines).items() if key not in excluded} for lines in groups]
@@ -136,7 +137,7 @@ def test_commented_sensors_are_valid_together():
 
 
 @pytest.mark.parametrize("plant", ["spacecraft", "chain"])
-def test_commented_keys_are_valid(plant):
+def test_commented_keys_of_a_new_scenario_are_valid(plant):
     """Every kind of every table, every dispersion and every attitude key is valid."""
     every = complete(plant)
     for _, tables in every:
@@ -199,7 +200,7 @@ def test_new_command_refuses_invalid_options_and_writes_nothing(command, tmp_pat
     assert refused(command, tmp_path, "new", *options) == f"ptsmc: {said}"
 
 
-def test_commented_keys_have_their_default_values(tmp_path):
+def test_commented_keys_of_a_new_scenario_have_their_default_values(tmp_path):
     """The gain of a finite-time observer is 20 times a bound, and positive if the bound is zero."""
     for bound, gain in ((0.0, 0.02), (2e-3, 0.04)):
         lines = blocks(new.scenario_text(None, {"controller": {"disturbance_rate_bound": bound}}))["observer"]

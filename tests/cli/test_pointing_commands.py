@@ -62,6 +62,7 @@ def one_by_one():
 # `test_montecarlo.py` and `test_lanes.py` test batches
 @pytest.fixture(params=short(["alone", "in a batch"], ["alone"]))
 def simulated(request, command, tmp_path, monkeypatch, one_by_one):
+    """Return exit status, output, rows and summary of a campaign with pointing requirements."""
     if request.param == "alone":
         monkeypatch.setattr(montecarlo, "run", one_by_one)
         monkeypatch.setattr(montecarlo, "prepare", lambda *_: None)
@@ -115,7 +116,7 @@ def test_pointing_requirements_have_verdicts_budget_and_table(simulated, tmp_pat
     assert [row[9] for row in table.rows] == ["22", "4", "every run"]  # 0.9^22 <= 0.1
 
 
-def test_worst_fraction_of_time_is_the_smallest(command, simulated, tmp_path):
+def test_worst_trials_by_a_fraction_of_time_have_the_smallest_fractions(command, simulated, tmp_path):
     _, said, rows, found = simulated
     within = rows["within_ape_boresight"].to_numpy()
     ordered = np.sort(within)

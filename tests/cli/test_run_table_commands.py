@@ -6,17 +6,12 @@ import shlex
 import polars as pl
 import pytest
 
-from ptsmc_jax.campaigns import campaign
 from tests.helpers import SHORT_CHAIN, refused, rows_of
 from tests.output.pages import checked
 
+pytestmark = pytest.mark.usefixtures("small_parts")
 CORNERS = "initial_x1,initial_x2\n1.4,0.0\n1.0,0.02\n0.5,-0.02\n"
 SCENARIO = SHORT_CHAIN.replace("[dispersion]", '[dispersion]\nstate_noise = { kind = "relative_normal" }')
-
-
-@pytest.fixture(autouse=True)
-def _small_parts(monkeypatch):
-    monkeypatch.setattr(campaign, "PART", 100)
 
 
 def test_run_table_of_a_dry_run_reproduces_the_campaign(command, tmp_path):

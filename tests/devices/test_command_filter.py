@@ -21,13 +21,16 @@ KINDS = {
 
 
 def digital(kind):
-    """Numerator and denominator in z by the bilinear transform, prewarped at W."""
+    """Return numerator and denominator of a filter in z by the bilinear transform, prewarped at W."""
     _, b, a = KINDS[kind]
     return signal.bilinear(b, a, fs=W / (2.0 * np.tan(W * H / 2.0)))
 
 
 def filtered(device, u, lengths):
-    """Outputs from rest for inputs u (samples,) with periods of these lengths (samples - 1,) [s] between them."""
+    """Return outputs of a filter from rest for inputs u (samples,).
+
+    The periods between the samples have these lengths (samples - 1,) [s].
+    """
     kept, out = device.begin(1), []
     for value, before, after in zip(u, [0.0, *lengths], [*lengths, H], strict=True):
         y, kept = device.step(kept, vector([value]), vector(before), vector(after))
@@ -36,7 +39,7 @@ def filtered(device, u, lengths):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_filter_equals_the_bilinear_transform(kind):
+def test_command_filter_equals_the_bilinear_transform(kind):
     device, _, _ = KINDS[kind]
     u = np.append(0.0, np.random.default_rng(0).normal(size=40))  # begins with a period at rest
     b, a = digital(kind)
@@ -44,7 +47,7 @@ def test_filter_equals_the_bilinear_transform(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_filter_state_has_only_the_poles_of_the_filter(kind):
+def test_state_of_a_command_filter_has_only_the_poles_of_the_filter(kind):
     """An unused constant state would add a pole at 1, which the margin analysis would use as spectral radius."""
     device, _, _ = KINDS[kind]
     start, tree = ravel_pytree(device.begin(1))
@@ -56,7 +59,7 @@ def test_filter_state_has_only_the_poles_of_the_filter(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_periods_of_any_length_integrate_the_same_filter(kind):
+def test_command_filter_is_accurate_for_periods_of_any_length(kind):
     """The response to an unevenly sampled sine has second-order accuracy, and a period of length 0 has no effect."""
     device, b, a = KINDS[kind]
     rng, errors = np.random.default_rng(1), []
@@ -82,7 +85,7 @@ ALONE = {
 }
 
 
-def test_linearised_loop_includes_the_filter():
+def test_linearised_loop_includes_the_command_filter():
     """The loops are linearised at the end of both runs, where only 3e-4 of the small initial angle remains."""
     found, tones = [], (0.3, 2.0, 6.0, 15.0)
     for hardware in ({}, {"hardware": {"command_filter": {"kind": "second_order", "corner": 6.0, "damping": 0.7}}}):

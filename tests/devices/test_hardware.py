@@ -24,6 +24,7 @@ PYRAMID = formulas.pyramid()
 
 
 def drive_of(device, v, c):
+    """Return the drive of channels with the torque v at the start of a period and the command c [N m]."""
     return actuators.Drive(vector(v), vector(c), None, jnp.asarray(False))
 
 
@@ -35,7 +36,7 @@ channels = jax.jit(
 
 @pytest.mark.parametrize("lag", [None, 0.03, 0.5])
 @pytest.mark.parametrize("rate_limit", [None, 0.4, 20.0])
-def test_channels_follow_their_differential_equation(lag, rate_limit):
+def test_torques_of_actuator_channels_follow_their_differential_equation(lag, rate_limit):
     """The equation is v' = clip((c - v)/lag, -R, R), or without a lag v' = R sign(c - v) until v = c."""
     device = actuators.Actuators(
         rate_limit=None if rate_limit is None else vector(rate_limit), lag=None if lag is None else vector(lag)
@@ -61,7 +62,7 @@ def test_channels_follow_their_differential_equation(lag, rate_limit):
 
 
 def commanded(device, u, *, v=None, h=None, dt=0.1):
-    """The drive of a command in one period from t = 0, and the actuator state at the end of the period."""
+    """Return the drive of a command in one period from t = 0, and the actuator state at the end of the period."""
     state = actuators.ActuatorState(None, None if v is None else vector(v), None if h is None else vector(h))
     t, dt, rest = vector(0.0), vector(dt), vector([0.0] * 3)
     drive, queue = device.command(state, vector(u), rest, t, dt, vector(1.0))
@@ -69,7 +70,7 @@ def commanded(device, u, *, v=None, h=None, dt=0.1):
 
 
 @pytest.mark.parametrize("lag", [None, 0.05])
-def test_a_command_counts_as_limited_if_one_axis_is_out_of_reach(lag):
+def test_a_command_counts_as_limited_if_one_axis_exceeds_its_rate_limit(lag):
     """The rate limit R does not act if |c - v| <= R (dt + lag)."""
     device = actuators.Actuators(rate_limit=vector(2.0), lag=None if lag is None else vector(lag))
     most = 2.0 * (0.1 + (lag or 0.0))
@@ -102,13 +103,14 @@ def test_effort_includes_the_lag_within_a_period(share):
     assert 0.0 < abs(got - exact) < dt**5 / 2880 * float(np.sum(np.abs(c - v))) / lag**4
 
 
-def test_quantisation_rounds_and_has_derivative_one():
+def test_quantisation_rounds_the_torque_and_has_derivative_one():
     u = vector([0.024, -0.036, 0.0])
     np.testing.assert_allclose(actuators.quantise(u, vector(0.01)), [0.02, -0.04, 0.0], atol=1e-17)
     np.testing.assert_array_equal(jax.jacfwd(lambda u: actuators.quantise(u, vector(0.01)))(u), np.eye(3))
 
 
 def with_device(device, t_end=23.0, **changes):
+    """Return the parts of a noisy slew of 20 s with these actuators."""
     run = parts(20.0, 3.0, 1.0, period=0.1, noise=(2e-5, 1e-6), flight=True, t_end=t_end, **changes)
     return dataclasses.replace(run, actuators=device)
 
@@ -129,7 +131,10 @@ def test_limited_and_quantised_torque_is_delivered_after_the_delay(step):
 
 
 def wheels_by_an_adaptive_integrator(inertia, axes, log, lag, limit, intervals):
-    """Attitude and wheel momenta from J w' = A v - w x (J w + A h) and h' = -v, from the first row of the log."""
+    """Return attitude and wheel momenta after some periods, integrated from the first row of the log.
+
+    The equations are J w' = A v - w x (J w + A h) and h' = -v.
+    """
     n, inverse = axes.shape[1], np.linalg.inv(inertia)
     y = np.concatenate([log.x.q[0], log.x.w[0], log.wheels[1][0], log.wheels[0][0]])
 
@@ -157,6 +162,7 @@ MOST, SAMPLES = 64, 160  # integration steps per period, and periods: equal, to 
 
 
 def as_many(ready, substeps=MOST):
+    """Return the study with SAMPLES periods of `substeps` integration steps, so that runs share one program."""
     timing = dataclasses.replace(ready.parts.clock, count=SAMPLES)
     return dataclasses.replace(ready, parts=dataclasses.replace(ready.parts, clock=timing, substeps=substeps))
 
@@ -203,7 +209,7 @@ CUBESAT = {
 
 
 @pytest.mark.parametrize("device", [{"torque_lag": 0.02}, {"torque_lag": 0.2}, {"torque_rate_limit": 5e-3}], ids=str)
-def test_chosen_steps_are_accurate_if_the_torque_changes_within_a_period(device):
+def test_chosen_integration_steps_are_accurate_if_the_torque_changes_within_a_period(device):
     """The attitude equals that of 64 steps a period to 2e-9 rad in a fast slew, and to 1e-11 rad at its end."""
     ready = scenario.study(scenario.from_tables({**CUBESAT, "wheels": {}, "hardware": device}))
     assert ready.parts.substeps < 8
@@ -223,7 +229,7 @@ def test_integration_steps_resolve_the_nutation():
     assert steps >= 0.4 / np.sqrt(0.05 * 0.08) * 0.2 / 0.025
 
 
-def test_different_gains_have_the_same_number_of_steps():
+def test_different_gains_have_the_same_number_of_integration_steps():
     """Another number of steps needs another compiled program."""
     frequency = {"flexible": {"frequency": [4.5], "damping": [0.005], "coupling": [[0.02, 0.0, 0.0]]}}
     tables = {**CUBESAT, **frequency, "loop": {**CUBESAT["loop"], "t_end": 60.0}}
@@ -250,12 +256,13 @@ def test_integration_steps_include_the_momentum_of_the_disturbance():
         ({"wheels": {}, "disturbance": {"kind": "constant", "amplitude": [0.5] * 3}}, r"^disturbance\.amplitude is"),
     ],
 )
-def test_momentum_that_is_too_large_for_the_period_raises_an_error(changes, said):
+def test_wheel_momentum_that_is_too_large_for_the_control_period_raises_an_error(changes, said):
     with pytest.raises(ScenarioError, match=said):
         scenario.study(scenario.from_tables({**CUBESAT, **changes}))
 
 
 def with_spinning(wheels, **changes):
+    """Return the parts of a slew with these wheels, without noise and disturbance."""
     quiet = disturbances.Constant(vector([0.0] * 3))
     run = parts(20.0, 3.0, 1.0, period=0.1, flight=True, disturbance=quiet, **changes)
     return dataclasses.replace(run, actuators=actuators.Actuators(wheels=wheels))
@@ -287,7 +294,7 @@ def test_wheel_and_allocation_change_at_the_same_sample_on_failure(early):
     assert (abs(float(drive.c[0])) > 1e-3) is early
 
 
-def test_allocation_gives_the_commanded_torque_for_any_geometry():
+def test_wheel_allocation_gives_the_commanded_torque_for_any_wheel_axes():
     rng = np.random.default_rng(0)
     for axes in (PYRAMID, np.eye(3), rng.normal(size=(6, 3)), 7.0 * rng.normal(size=(3, 3))):
         found = actuators.wheels(axes)
@@ -302,7 +309,7 @@ def test_allocation_gives_the_commanded_torque_for_any_geometry():
 
 
 def everything(delta=0.93, **changes):
-    """A run with every device enabled."""
+    """Return the parts of a run with every device enabled."""
     run = parts(
         15.0,
         3.2,
@@ -370,7 +377,7 @@ def test_gravity_gradient_is_the_textbook_torque():
 
 
 def walking():
-    """A run whose disturbance is a random walk of 1e-3 N m / sqrt(s)."""
+    """Return the parts of a run whose disturbance is a random walk of 1e-3 N m / sqrt(s)."""
     run = parts(10.0, 3.0, 0.5, period=0.1, t_end=12.0, disturbance=disturbances.Constant(vector([0.0] * 3)))
     return dataclasses.replace(run, walk_rate=vector([1e-3 / np.sqrt(0.1)] * 3))
 
@@ -386,7 +393,7 @@ def test_random_walk_is_the_sum_of_its_random_steps():
     assert np.ptp(grown, axis=0).min() > 1e-4
 
 
-def test_gradients_are_finite_where_functions_are_not_differentiable():
+def test_gradients_of_actuators_are_finite_where_functions_are_not_differentiable():
     """These points are at a limit, at rest and at the target, where clip, sign and the end of a ramp have a kink."""
     device = actuators.Actuators(
         torque_limit=vector(0.3), rate_limit=vector(0.5), lag=vector(0.1), step=vector(0.1),

@@ -23,18 +23,18 @@ RATE = np.array([0.02, -0.03, 0.05])  # [rad/s], constant, so that the filter pr
 
 
 def tick(sample):
-    """The control period after a sample, of a clock that starts at t = 0."""
+    """Return the control period after a sample, of a clock that starts at t = 0."""
     t = sample * vector(H)
     return Ticks(t, t + H, jnp.asarray(False), jnp.asarray(sample), vector(1.0), jnp.asarray(False))
 
 
 def state(t):
-    """The true state at a time [s] of a body that turns at a constant rate."""
+    """Return the true state at a time [s] of a body that turns at a constant rate."""
     return AttitudeState(attitude.from_rotation_vector(t * vector(RATE)), vector(RATE))
 
 
 def filtered(suite, trial, count):
-    """Errors (count, 9) of attitude, bias and gyro noise after each sample, and the filter's covariance of them."""
+    """Return errors (count, 9) of attitude, bias and gyro noise after each sample, and the filter's covariances."""
 
     def step(memory, k):
         dt = jnp.where(k > 0, H, 0.0)
@@ -52,7 +52,7 @@ def filtered(suite, trial, count):
 
 
 def sun_and_field(period):
-    """Two vector sensors with different rates and latencies, which determine the attitude together."""
+    """Return a suite of two vector sensors with different rates and latencies. Only both determine the attitude."""
     made = []
     for k, (direction, interval, latency) in enumerate([([0.6, 0.0, 0.8], 2, 1), ([0.0, 1.0, 0.0], 3, 0)]):
         made.append(
@@ -86,7 +86,7 @@ def test_normalised_estimation_error_squared_is_within_its_95_percent_interval(c
         assert low < np.mean(np.sum(weighed * errors[:, k], axis=1)) < high
 
 
-def test_filter_equals_batch_conditioning_on_all_readings():
+def test_kalman_filter_of_a_sensor_suite_equals_batch_conditioning_on_all_readings():
     """At rest the errors are linear. The test conditions a Gaussian vector of all unknowns on every received reading.
 
     The unknowns are the initial errors of attitude and bias, and in each period the drift and the gyro noise.
@@ -185,7 +185,7 @@ def test_a_delayed_reading_is_the_attitude_at_its_own_time():
 
 
 @pytest.mark.parametrize("case", ["latency", "own clocks", "outage"])
-def test_available_and_lag_equal_the_simulated_readings(case):
+def test_predicted_times_and_delays_of_readings_equal_the_simulated_ones(case):
     suite, count = CASES[case]().without_noise(), 40
     ticks = jax.vmap(tick)(jnp.arange(count))
     available, lag = suite.available(ticks), suite.sample_delays(ticks)
@@ -206,7 +206,7 @@ def test_available_and_lag_equal_the_simulated_readings(case):
         np.testing.assert_array_equal(np.flatnonzero(second), range(0, count, 8))
 
 
-def test_no_random_numbers_are_generated_without_noise():
+def test_a_sensor_suite_without_noise_generates_no_random_numbers():
     quiet = suites.two_star_trackers(H).without_noise()
     trace = jax.make_jaxpr(lambda seed: quiet.begin(seed, 0, state(0.0), tick(0)))(jnp.uint32(3))
     assert not any(one.primitive.name == "shift_left" for one in equations(trace))  # every random number needs it
@@ -218,7 +218,7 @@ def test_a_sensor_without_noise_raises_an_error():
         suites.suite([dataclasses.replace(tracker, noise=vector([1e-5, 1e-5, 0.0]))], H)
 
 
-def test_the_kalman_filter_of_a_suite_is_no_gain_of_the_parts():
+def test_the_kalman_filter_of_a_sensor_suite_has_no_bandwidth_to_tune():
     made = dataclasses.replace(parts(), sensors=suites.two_star_trackers(H))
     assert "filter_bandwidth" not in gains.gains_of(made)
     with pytest.raises(ValueError, match="filter_bandwidth is no gain of these parts"):

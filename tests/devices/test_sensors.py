@@ -23,12 +23,13 @@ STATE = rigid_body.AttitudeState(vector(ATTITUDE.as_quat()), vector([0.01, -0.2,
 
 
 def tick(sample, weight=1.0):
-    """A control period with this number and weight, the only values that sensors use."""
+    """Return a control period with this number and weight, the only values that sensors use."""
     zero = vector(0.0)
     return ticks.Ticks(zero, zero, jnp.asarray(False), jnp.asarray(sample), vector(weight), jnp.asarray(weight < 1.0))
 
 
 def seen_by(sensor, x, seed, trial, sample):
+    """Return the measured state of a sensor at one sample."""
     return sensor.measure(sensor.begin(seed, trial, x, tick(sample)), x, tick(sample), vector(0.05))[0]
 
 
@@ -61,7 +62,7 @@ def test_state_sensor_adds_noise_of_the_stated_size_to_every_state():
     np.testing.assert_allclose(seen_by(sensor, x, 7, 8, -5), x + noise, rtol=8 * EPS)
 
 
-def test_filter_propagates_a_rotating_body():
+def test_propagation_of_the_attitude_filter_converges_to_the_exact_rotation():
     """With the two-sample coning correction the error of a period is of fifth order in its length."""
     found = attitude_filter.attitude_filter(0.2, 1e-5, 1e-6, 0.0, 0.05, 1)
     errors = []
@@ -88,9 +89,10 @@ TRACKED = {"period": 0.25, "every": 4, "attitude_noise": 2e-5, "rate_noise": 2e-
 
 @pytest.fixture(scope="module")
 def filtered():
-    """A function (first sample, factor of the steady-state error at the start, samples) -> (sample, error, 12 000).
+    """Return a function of first sample, factor of the initial error and number of samples.
 
-    The errors are those of attitude [rad] and bias [rad/s] just after each sample, for 4 000 trials of a body at rest.
+    It simulates 4000 trials of a body at rest, and returns errors (samples, 2, trials and axes) of attitude [rad] and
+    bias [rad/s] just after each sample.
     """
     period, every, noise, gyro, walk = (TRACKED[name] for name in list(TRACKED)[:5])
     found = attitude_filter.attitude_filter(TRACKED["bandwidth"], noise, gyro, walk, period, every)
@@ -116,9 +118,10 @@ def filtered():
 
 
 def steady():
-    """Steady-state covariance of a filter's errors just before each control sample, by iteration.
+    """Return the steady-state covariance of a filter's errors just before each control sample, by iteration.
 
-    The states are attitude, bias and the gyro noise at the sample, because each gyro sample acts in two periods.
+    The iterated states are attitude, bias and the gyro noise at the sample, because each gyro sample acts in two
+    periods. The function also returns the correction matrix and the noise covariance of a star tracker sample.
     """
     h, every, noise, gyro, walk, bandwidth = TRACKED.values()
     k1, k2 = (float(v) for v in attitude_filter.filter_gains(vector(bandwidth), h * every))
@@ -134,7 +137,7 @@ def steady():
     return np.array(found)[:, :2, :2], keep[:2, :2], star[:2, :2]
 
 
-def test_filter_spread_equals_the_iterated_covariance():
+def test_covariance_of_the_attitude_filter_equals_the_iterated_steady_state():
     found = np.asarray(attitude_filter.attitude_filter(**{k: TRACKED[k] for k in sorted(TRACKED)}).spread)
     covariance, keep, star = steady()
     np.testing.assert_allclose(found @ found.swapaxes(1, 2), covariance, rtol=1e-12)
@@ -158,7 +161,7 @@ def test_filter_errors_are_stationary_from_the_first_sample(first, filtered):
     assert smallest < 0.6 * TRACKED["attitude_noise"]  # the filter reduces the noise
 
 
-def test_filter_start_is_continuous_when_the_partial_first_period_vanishes():
+def test_start_of_the_attitude_filter_is_continuous_when_the_partial_first_period_vanishes():
     found = attitude_filter.attitude_filter(0.15, 2e-5, 2e-6, 1e-7, 0.25, 4)
     q, none, normals = STATE.q, vector([0.0] * 3), vector([1.0, -0.3, 0.2, 0.5, 0.1, -1.0])
     for k in range(-4, 1):
@@ -166,7 +169,7 @@ def test_filter_start_is_continuous_when_the_partial_first_period_vanishes():
         jax.tree.map(np.testing.assert_array_equal, vanishing, whole)
 
 
-def test_filter_corrects_at_star_tracker_samples_only_and_by_their_weight():
+def test_attitude_filter_corrects_at_star_tracker_samples_only_and_by_their_weight():
     found = attitude_filter.attitude_filter(0.5, 1e-5, 1e-6, 0.0, 0.1, 3)
     sensor = sensors.Sensors(vector(0.0), vector(0.0), None, None, found, 3)
     begun = sensor.begin(0, 0, STATE, tick(0))
@@ -183,14 +186,14 @@ def test_filter_corrects_at_star_tracker_samples_only_and_by_their_weight():
     np.testing.assert_allclose(left(-3, 0.5), 1e-3 * (1 - 0.5 * float(k1)), rtol=1e-6)
 
 
-def test_filter_gains_place_both_poles_at_the_documented_value():
+def test_gains_of_the_attitude_filter_place_both_poles_at_the_documented_value():
     k1, k2 = (float(v) for v in attitude_filter.filter_gains(vector(0.7), 0.4))
     matrix = np.array([[1 - k1, 0], [k2, 1]]) @ np.array([[1, -0.4], [0, 1]])
     poles = np.linalg.eigvals(matrix)
     np.testing.assert_allclose(poles, np.exp(-0.28), rtol=1e-6)  # a double pole: its roots are found to sqrt(eps)
 
 
-def test_bias_of_the_gyro_is_constant_and_has_its_size():
+def test_gyro_bias_is_constant_and_has_the_stated_size():
     sensor = sensors.Sensors(vector(0.0), vector(0.0), vector(3e-5))
     bias = 3e-5 * draws.normals(draws.stream(1, 4, "rate_bias"), 3)
     for k in (0, 5):

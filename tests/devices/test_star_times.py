@@ -22,14 +22,17 @@ SIGMAS = 6.0
 
 
 def of(**hardware):
-    """The study of a short scenario with an attitude filter, on the flight clock."""
+    """Return the study of a short scenario with an attitude filter and these keys of [hardware].
+
+    The control periods are on the flight clock.
+    """
     case_one = {"amplitude": [0.01] * 3, "frequency": [0.1] * 3}
     tables = flight(**FILTER, hardware=hardware, loop={"clock": "flight"}, disturbance=case_one)
     return scenario.study(scenario.from_tables({**tables, "dispersion": {}}))
 
 
 @pytest.mark.parametrize("interval", [0.25, 1 / 3, 0.1 * math.pi])
-def test_samples_are_used_at_the_same_times_in_32_bits(interval):
+def test_star_tracker_samples_are_used_at_the_same_times_in_32_bits(interval):
     times, count = attitude_sensors.sample_times(interval, 0.0, 0.1), 18_000
     for first in (0, -count):  # half an hour, after which the resolution of 32 bits is a thousandth of a period
         due = times.is_reading_due(jnp.arange(first, first + count))
@@ -41,7 +44,7 @@ def test_samples_are_used_at_the_same_times_in_32_bits(interval):
 
 
 def by_hand(parts, simulated):
-    """The filter's attitude (as a rotation) and bias at each sample, computed with NumPy and SciPy."""
+    """Return the filter's attitude (as a rotation) and bias at each sample, computed with NumPy and SciPy."""
     known = parts.sensors.filter
     k1, k2 = float(known.attitude_gain), float(known.bias_gain)
     said = [(Rotation.from_quat(simulated.before["attitude"][0]), simulated.before["bias"][0])]
@@ -69,14 +72,14 @@ def by_hand(parts, simulated):
 
 @pytest.fixture(scope="module")
 def run():
-    """The parts of a scenario at 10 Hz with a star tracker at 4 Hz, and the samples of a run."""
+    """Return the parts of a scenario at 10 Hz with a star tracker at 4 Hz, and the samples of a run."""
     ready = of(star_tracker_period=0.25, rate_bias=1e-4)
     parts = dataclasses.replace(ready.parts, walk_rate=None)
     simulated = vectors.simulate_many(parts, ready.dispersion, jnp.uint32(3), jnp.arange(1, dtype=jnp.uint32))
     return parts, vectors.single_trial(simulated, 0)
 
 
-def test_filter_equals_the_independent_computation(run):
+def test_attitude_filter_with_a_star_tracker_clock_equals_an_independent_computation(run):
     parts, simulated = run
     valid = simulated.inputs["attitude_valid"] > 0.0
     assert np.flatnonzero(valid[:12]).tolist() == [0, 3, 5, 8, 10]
@@ -125,7 +128,7 @@ def test_star_tracker_measures_the_attitude_at_its_own_sample_time(run):
     assert looked_at == 11  # 0.25 to 2.75 s
 
 
-def test_an_integer_ratio_gives_the_same_parts_as_star_tracker_every():
+def test_a_star_tracker_period_of_five_control_periods_equals_star_tracker_every_5():
     one, other = of(star_tracker_period=0.5).parts, of(star_tracker_every=5).parts
     assert jax.tree.structure(one) == jax.tree.structure(other)
     jax.tree.map(np.testing.assert_array_equal, one, other)
@@ -135,7 +138,7 @@ NOISES = {"bandwidth": 0.15, "attitude_noise": 2e-5, "rate_noise": 2e-6, "bias_w
 
 
 @pytest.mark.parametrize("every", [1, 4])
-def test_filter_between_equals_attitude_filter_for_an_integer_ratio(every):
+def test_filter_for_a_star_tracker_clock_equals_attitude_filter_for_an_integer_ratio(every):
     found = attitude_filter.filter_between_samples(
         *NOISES.values(), interval=0.25 * every, periods_and_samples=(every, 1)
     )
@@ -192,7 +195,7 @@ def test_in_an_outage_the_filter_propagates_the_whole_period_at_once(run):
     np.testing.assert_allclose(found.q, alone.q, rtol=0, atol=1e-15)
 
 
-def test_an_outage_removes_the_samples_taken_during_it():
+def test_an_outage_removes_the_star_tracker_samples_taken_during_it():
     """The time of the measurement, 0.25 s, counts, and not the time of its use, 0.3 s."""
     own = of(star_tracker_period=0.25).parts.sensors
     now = Ticks(vector(0.3), vector(0.4), jnp.asarray(False), jnp.int32(3), vector(1.0), jnp.asarray(False))
@@ -202,7 +205,7 @@ def test_an_outage_removes_the_samples_taken_during_it():
 
 @pytest.fixture(scope="module")
 def anchored():
-    """The parts of a scenario with such a star tracker on the anchored clock."""
+    """Return the parts of a scenario with a star tracker at 4 Hz on the anchored clock."""
     tables = {**flight(**FILTER, hardware={"star_tracker_period": 0.25}), "dispersion": {}}
     return scenario.study(scenario.from_tables(tables)).parts
 
@@ -218,7 +221,7 @@ def test_metrics_are_continuous_when_the_partial_first_period_vanishes(anchored)
     np.testing.assert_allclose(found[2], found[1], rtol=1e-4)
 
 
-def test_in_step_gives_the_same_correction_and_noise_per_interval():
+def test_star_tracker_moved_to_control_samples_has_the_same_correction_and_noise_per_interval():
     """The sum of the corrections in an interval is the same, and so is the sum of their noise variances."""
     own = of(star_tracker_period=0.25).parts.sensors
     often, share = own.at_control_samples(), 0.1 / 0.25
