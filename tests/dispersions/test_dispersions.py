@@ -40,6 +40,7 @@ KINDS = {
 
 
 def initial_attitude(kind, seed, trial):
+    """Return the random initial attitude, a quaternion, of a trial."""
     return Dispersion({"initial_attitude": kind}).apply(PARTS, seed, trial).initial.q
 
 
@@ -84,7 +85,7 @@ def parts_at(run, given):
 
 
 @pytest.mark.parametrize("c", [(0.1, 0.2, 0.0), (0.5, 0.9, 0.3), (0.97, 0.6, 1.0)])
-def test_attitudes_are_rotated_from_the_random_reference(c):
+def test_initial_attitudes_are_rotated_from_the_random_reference_attitude(c):
     """The height on the sphere and the azimuth of a uniform axis are uniform (Archimedes)."""
     spread = RandomNumbers("normal", vector([0.05] * 3))
     got = parts_at(PARTS, {"initial_attitude": (KINDS["axis_angle"], c), "reference": (spread, [1.0, -2.0, 0.5])})
@@ -96,7 +97,7 @@ def test_attitudes_are_rotated_from_the_random_reference(c):
     np.testing.assert_array_equal(got.reference.rate, PARTS.reference.rate)
 
 
-def test_initial_attitudes_and_rates_at_given_coordinates():
+def test_initial_attitudes_and_rates_equal_closed_forms_of_their_random_numbers():
     """A normalised vector of four normal numbers is a uniform attitude (Muller, 1959)."""
     rates = RandomNumbers("normal", vector([0.01] * 3))
     got = parts_at(PARTS, {"initial_attitude": (KINDS["normal"], [1.0, -2.0, 0.5]), "initial_rate": (rates, [0, 1, 0])})
@@ -109,7 +110,7 @@ def test_initial_attitudes_and_rates_at_given_coordinates():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_trial_does_not_depend_on_the_batch(kind):
+def test_random_initial_attitude_does_not_depend_on_the_batch(kind):
     trials = jnp.asarray([0, 1, 5, 2**32 - 1], dtype=jnp.uint32)
     alone = np.stack([initial_attitude_jit(KINDS[kind], 9, trial) for trial in trials])
     for batch in (
@@ -142,10 +143,12 @@ def test_initial_states_of_a_chain_use_their_random_stream():
 
 
 def uniform_phases(count):
+    """Return the distribution of phases that are uniform from 0 to 2 pi."""
     return RandomNumbers("interval", vector(np.full(count, 2.0 * np.pi)))
 
 
 def sample_inertias(moments, std, turn=0.0, axes=None):
+    """Return random inertias and their inverses (TRIALS, 3, 3) about these principal moments."""
     axes = np.eye(3) if axes is None else axes
     kind = numbers.RelativeInertia(vector(moments), vector(axes), vector(std), vector(turn))
     plant = plants_of(Dispersion({"inertia": kind}), jnp.arange(TRIALS, dtype=jnp.uint32))
@@ -171,7 +174,7 @@ def test_every_sampled_inertia_is_physical(moments):
 
 @pytest.mark.parametrize("std", [0.05, 0.2])
 @pytest.mark.parametrize("moments", [[20.0, 0.02, 20.0], [10.0, 10.0, 0.1], [1e-4, 100.0, 100.0]])
-def test_slender_bodies_have_the_stated_distribution(moments, std):
+def test_sampled_inertias_of_slender_bodies_have_the_stated_distribution(moments, std):
     """The two large moments a and b may differ by at most the small one, c, which few samples satisfy.
 
     c is small compared with the spread of a - b. So (a - b) / c is nearly uniform, c has its normal density times c,
@@ -205,7 +208,7 @@ BODIES = list(itertools.product(MOMENTS, (0.05, 0.3)))
 
 
 @pytest.mark.parametrize(("moments", "std"), short(BODIES, [BODIES[0], BODIES[4], BODIES[7]]))
-def test_fallback_samples_have_the_distribution_of_repeated_rejection(moments, std):
+def test_fallback_samples_of_the_inertia_have_the_distribution_of_repeated_rejection(moments, std):
     """All candidates are set beyond three sigma, so that only the fallback for slender bodies is used."""
     rng = np.random.default_rng(1)
     kind = numbers.RelativeInertia(vector(moments), vector(np.eye(3)), vector(std), vector(0.0))
@@ -223,7 +226,7 @@ def test_fallback_samples_have_the_distribution_of_repeated_rejection(moments, s
     assert not np.any(np.all(found == moments, axis=1))
 
 
-def test_first_physical_candidate_is_used():
+def test_sampled_inertia_is_the_first_physical_candidate():
     rng, moments, std = np.random.default_rng(2), np.array([10.0, 12.0, 20.0]), 0.2
     kind = numbers.RelativeInertia(vector(moments), vector(np.eye(3)), vector(std), vector(0.0))
     c = rng.standard_normal((1 << 15, kind.count))
@@ -250,7 +253,7 @@ def test_sampled_inertias_have_finite_derivatives(moments):
             assert all(np.all(np.isfinite(jacobian)) for jacobian in jax.tree.leaves(inertia_jacobians(kind, c)))
 
 
-def test_principal_axes_are_rotated_by_a_normal_rotation_vector():
+def test_principal_axes_of_sampled_inertias_are_rotated_by_a_normal_rotation_vector():
     axes, moments = Rotation.from_rotvec([0.3, -0.2, 0.9]), np.array([5.0, 10.0, 14.0])
     kind = numbers.RelativeInertia(vector(moments), vector(axes.as_matrix()), vector(0.0), vector(0.01))
     c = np.zeros(kind.count)
@@ -267,7 +270,7 @@ STILL = disturbances.Constant(vector([0.1, 0.2, 0.3]))
 C = np.random.default_rng(0).uniform(size=7)
 
 
-def test_phases_are_added_to_all_periodic_terms():
+def test_random_phases_are_added_to_all_periodic_disturbances():
     run = replace(PARTS, disturbance=disturbances.Sum((SINE, STILL, ORBIT, SINE)))
     got = parts_at(run, {"disturbance_phase": (uniform_phases(7), C)}).disturbance.terms
     np.testing.assert_array_equal(got[1].amplitude, STILL.amplitude)
@@ -301,7 +304,7 @@ def test_relative_dispersions_scale_the_nominal_value():
     np.testing.assert_array_equal(got.sensors.rate_noise, 1e-6)
 
 
-def test_amplitudes_are_scaled_independently_and_a_bias_is_added():
+def test_amplitudes_of_disturbances_are_scaled_independently_and_a_bias_is_added():
     run = replace(PARTS, disturbance=disturbances.Sum((SINE, ORBIT, STILL)))
     added, factors = RandomNumbers("normal", vector([0.01] * 3)), RandomNumbers("uniform", vector([0.5] * 6))
     given = {"disturbance_bias": (added, [1.0, -2.0, 0.5]), "disturbance_amplitude": (factors, C[:6])}
@@ -339,7 +342,7 @@ def test_random_numbers_of_a_quantity_do_not_depend_on_other_quantities():
     assert len({float(v[0]) for v in c.values()}) == len(c) == 9
 
 
-def test_columns_of_quantities_have_units():
+def test_columns_of_dispersed_quantities_have_units():
     tables = {
         "flexible": {"frequency": [3.0], "damping": [0.01], "coupling": [[0.5, 0.0, 0.0]]},
         "loop": {"mode": "sampled"}, "hardware": {"attitude_noise": 1e-5, "torque_limit": 1.0}, "wheels": {},

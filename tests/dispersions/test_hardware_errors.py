@@ -42,6 +42,7 @@ def enlarged(parts):
 
 @pytest.fixture(scope="module")
 def dispersed():
+    """Return the study of a flexible spacecraft with dispersed hardware errors, without outage, failure and jitter."""
     ready = scenario.study(scenario.from_tables({**FLIGHT, "dispersion": DISPERSION}))
     hardware = {name for name, quantity in QUANTITIES.items() if quantity.hardware}
     assert set(ready.dispersion.kinds) == hardware - {"star_tracker_outage", "wheel_failure", "timing_jitter"}
@@ -65,7 +66,7 @@ def with_hardware_errors(parts, frequency, coupling, device, sensors):
 METRICS = ("window_error", "peak_torque", "effort", "residual_modal", "peak_torque_delivered")
 
 
-def test_every_trial_equals_a_run_that_is_built_from_its_columns(dispersed):
+def test_every_trial_equals_a_run_that_is_built_from_its_row_of_hardware_errors(dispersed):
     trials = [runs.simulate(dispersed, 5, trial) for trial in range(3)]
     for trial, run in enumerate(trials):
         row = dispersed.dispersion.values(run.parts)
@@ -195,7 +196,7 @@ def test_all_wheels_fail_with_equal_probability_and_default_times_extend_to_the_
             }  # fmt: skip
 
 
-def test_outage_of_the_whole_run_equals_a_filter_without_corrections():
+def test_star_tracker_outage_of_the_whole_run_equals_a_filter_without_corrections():
     """One wheel would fail after the end of the run, so that the program includes wheel failures."""
     lasting = {"kind": "uniform", "duration": 100.0, "latest": 0.0}
     after_end = {"kind": "uniform", "earliest": 50.0, "latest": 60.0, "known": True}
@@ -269,7 +270,7 @@ JITTER_CASES = [
 
 
 @pytest.mark.parametrize("tables", JITTER_CASES)
-def test_jitter_of_zero_changes_no_digit(tables):
+def test_timing_jitter_of_zero_changes_no_digit_of_the_metrics(tables):
     parts = scenario.study(scenario.from_tables({**tables, "dispersion": {}})).parts
     one, other = (fly(p, 5, 1) for p in (parts, replace(parts, jitter=vector(0.0))))
     for name, value in one.metrics.items():
@@ -284,7 +285,7 @@ def test_jitter_of_zero_changes_no_digit(tables):
         ({"kind": "relative_uniform", "half_width": 0.021}, {"kind": "relative_normal", "std": 0.02}),
     ],
 )
-def test_widest_allowed_coupling_is_physical_at_its_extreme_and_a_wider_one_is_refused(coupling, inertia):
+def test_widest_allowed_modal_coupling_is_physical_and_a_wider_one_is_refused(coupling, inertia):
     """The extreme has the longest coupling rows and the smallest moments. A width larger by a tenth is refused."""
     dispersion = {"mode_coupling": coupling, **({"inertia": inertia} if inertia else {})}
     tables = {**FLIGHT, "spacecraft": {"inertia": [10.0, 12.0, 14.0]},

@@ -25,7 +25,7 @@ def test_the_distribution_places_a_value_at_the_middle_of_its_step():
     np.testing.assert_allclose(np.asarray(axes.lines[0].get_xydata()), [[1.0, 1 / 8], [2.0, 3 / 8], [3.0, 5 / 8]])
 
 
-def test_the_label_of_a_limit_is_above_the_plot():
+def test_the_legend_of_a_distribution_with_a_limit_is_above_the_axes():
     values = np.random.default_rng(0).lognormal(0.0, 1.0, 2000)
     figure = campaign_plots.distributions({"a": campaign_plots.Column("N m", values, 1.5)})
     figure.draw_without_rendering()
@@ -35,7 +35,7 @@ def test_the_label_of_a_limit_is_above_the_plot():
     assert legend.get_window_extent().y0 >= axes.get_window_extent().y1
 
 
-def test_each_outcome_is_drawn():
+def test_each_outcome_of_a_trial_is_drawn_with_a_visible_marker():
     outcome = np.array(list(campaign_plots.MARKS), dtype=object)
     x, labels = 1.0 + np.arange(outcome.size), {name: f"{name}: 7" for name in campaign_plots.MARKS}
     start, torque = campaign_plots.Column("rad", x), campaign_plots.Column("N m", x)
@@ -51,7 +51,7 @@ def test_each_outcome_is_drawn():
 
 
 @pytest.mark.parametrize("count", [1, 4])
-def test_the_title_of_inputs_is_inside_the_figure(count):
+def test_legend_and_texts_of_the_figure_of_inputs_are_inside_it(count):
     outcome, x = np.full(3, campaign_plots.AT_TIMES, dtype=object), np.arange(1.0, 4.0)
     drawn = {f"initial_angle_{k}": campaign_plots.Column("rad", x) for k in range(count)}
     metrics = {"peak_torque": campaign_plots.Column("N m", x, 2.0)}

@@ -18,7 +18,7 @@ def test_signals_show_every_component_and_a_legend_below_them():
     assert legend.get_window_extent().y1 < axes.get_window_extent().y0
 
 
-def test_rejected_readings_are_crosses():
+def test_rejected_readings_are_drawn_as_crosses():
     """A reading far beyond the others is drawn at the edge, and its predicted value is missing."""
     t, measured = np.arange(6.0), np.stack([np.arange(6.0), np.zeros(6)], axis=1)
     measured[3, 0] = 1e6
@@ -32,12 +32,12 @@ def test_rejected_readings_are_crosses():
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["component 1", "component 2", "rejected"]
 
 
-def test_a_proposed_manoeuvre_names_its_components():
+def test_the_figure_of_a_proposed_manoeuvre_names_its_components():
     figure = identification_plots.profile(np.arange(5.0), [("command [N m]", np.ones((5, 3)))])
     assert [text.get_text() for text in figure.legends[0].get_texts()] == [f"component {k}" for k in (1, 2, 3)]
 
 
-def test_the_prior_interval_of_a_uniform_phase_is_the_circle():
+def test_the_prior_interval_of_a_uniform_phase_is_drawn_as_a_full_turn():
     row = {
         "parameter": "disturbance_phase",
         "estimate": 2.0,

@@ -25,7 +25,7 @@ def test_the_axis_of_the_time_to_go_has_plain_numbers():
     assert not [label for label in labels if "$" in label]
 
 
-def test_a_panel_states_that_there_is_no_limit():
+def test_a_panel_of_infinite_margins_states_that_there_is_no_limit():
     """A saturated loop tolerates any gain and delay. An earlier version left the panel empty."""
     few = np.array([10.0, 5.0]), np.full(2, True)
     free = {name: np.full((2, 3), np.inf) for name in ("gain_up", "gain_down")}
@@ -35,7 +35,7 @@ def test_a_panel_states_that_there_is_no_limit():
     assert not margin_plots.margins_over_time(*few, margins(2)._replace(**free), one).axes[0].texts
 
 
-def test_times_that_are_not_judged_are_grey():
+def test_times_whose_margins_are_not_judged_are_grey():
     """Frozen gains give small margins at the start, which no requirement judges."""
     time_to_go, judged = np.array([40.0, 20.0, 10.0, 5.0, 2.0, 1.0]), np.array([False, False, True, False, True, False])
     figure = margin_plots.margins_over_time(time_to_go, judged, margins(6), margins(1))
@@ -103,7 +103,7 @@ def test_the_contour_of_a_nichols_chart_has_a_sensitivity_of_six_decibels():
     assert phase.min() < -180.0 < phase.max()
 
 
-def test_both_sensitivities_have_the_right_labels():
+def test_the_curves_of_sensitivity_and_complementary_sensitivity_have_the_right_labels():
     """If L is large, S is small and T is 1."""
     w = np.geomspace(1e-2, 1.0, 50)
     L = 0.1 / (1j * w)[:, None]

@@ -50,7 +50,7 @@ def test_theoretical_decay_lines_have_the_labelled_powers(order):
     assert said == ["slope $\\eta$ = 4.5", "slope $\\eta+n-2$ = 5.5"][: order - 1]
 
 
-def test_the_window_that_a_run_is_judged_in_is_shaded():
+def test_the_window_of_the_window_error_is_shaded():
     short = ptsmc_jax.replace(from_tables(untuned(SHORT_CHAIN)), loop__window=0.75)
     (axes,) = ptsmc_jax.simulate(short).plot("error")["error"].axes
     (window,) = [patch for patch in axes.patches if str(patch.get_label()).startswith("window")]
@@ -88,7 +88,7 @@ def test_required_limits_are_drawn_in_the_intervals_in_which_they_apply():
     assert [label for label in labels if label.startswith("limit")] == ["limit of peak_torque 3 N m"]
 
 
-def test_wheels_show_the_required_limit_and_their_own():
+def test_figures_of_wheels_show_the_required_limit_and_the_limit_of_the_wheels():
     wheels = {"kind": "pyramid", "torque_limit": 2.0, "momentum_limit": 500.0}
     tables = untuned(SHORT) | {"wheels": wheels, "requirements": {"peak_wheel_torque": 1.5}}
     figures = ptsmc_jax.simulate(from_tables(tables)).plot("wheels", "wheel_torque")

@@ -65,7 +65,7 @@ def test_a_tradeoff_figure_has_each_trial_and_their_rms():
     assert axes.get_xlabel() == "RMS pointing error in the window [arcsec]"
 
 
-def test_the_first_set_of_a_tradeoff_figure_is_not_hidden_by_a_later_one_at_the_same_place():
+def test_the_first_points_of_a_tradeoff_figure_are_drawn_above_later_points_at_the_same_place():
     same = np.array([3e-6, 4e-6]), np.array([0.2, 0.4])
     (axes,) = study_plots.tradeoff({"tuned": same, "before": same}, {}).axes
     tuned, before = (line for line in axes.lines if ": RMS" in str(line.get_label()))
@@ -73,13 +73,14 @@ def test_the_first_set_of_a_tradeoff_figure_is_not_hidden_by_a_later_one_at_the_
     assert axes.get_ylabel() == "peak commanded torque [N m]"
 
 
-def test_sensitivities_of_an_error_and_its_angle_are_drawn_once():
+def test_sensitivities_of_an_error_and_its_pointing_angle_are_drawn_once():
     figure = study_plots.tornado({name: {"eta": -1.0} for name in ("window_error", "peak_torque", "window_angle")})
     assert [axes.get_title(loc="left") for axes in figure.axes] == ["peak_torque", "window_angle"]
 
 
 @pytest.mark.parametrize(("low", "high", "least"), [(1e-6, 0.1, 5), (4.167e-5, 0.1188, 4)])  # second: long numbers
 def test_profiles_name_the_violated_limit_and_their_numbers_do_not_overlap(low, high, least):
+    """A profile shows the objective along one gain, with the largest violation at each value."""
     at = np.geomspace(low, high, 4)
     over, nearest = np.array([1.2, 0.5, 1.1, 1.5]), ["peak_torque", "peak_torque", "gain_margin", "peak_torque"]
     figure = study_plots.profiles({"sign_width": study_plots.Profile("-", at, at, over, nearest, 1e-3)}, "objective")
@@ -143,7 +144,7 @@ def test_a_limit_far_above_the_curves_is_labelled_and_does_not_flatten_them(limi
     assert said == f"limit of peak_torque {limit:g} N m" + ("" if drawn else ", beyond this axis")
 
 
-def test_cells_of_a_map_meet_half_way_between_grid_points():
+def test_cells_of_a_map_meet_in_the_middle_between_grid_points():
     np.testing.assert_allclose(study_plots.MapAxis("x", [1.0, 2.0, 4.0], False).edges, [0.5, 1.5, 3.0, 5.0])
     powers = 2.0 ** np.array([-0.5, 0.5, 1.5, 2.5])  # the axis is logarithmic
     np.testing.assert_allclose(study_plots.MapAxis("x", [1.0, 2.0, 4.0], True).edges, powers)
@@ -210,7 +211,7 @@ def test_the_required_torque_is_drawn_on_the_largest_peak_torque(limit, drawn):
     assert text.get_text() == f"limit of peak_torque {limit:g} N m" + ("" if drawn else ", beyond this map")
 
 
-def test_an_axis_of_whole_numbers_has_no_halves():
+def test_a_map_axis_of_whole_numbers_has_ticks_at_whole_numbers_only():
     delay = study_plots.MapAxis("hardware.delay", [0.0, 1.0], False)
     figure = study_plots.accuracy_map(delay, delay, dict.fromkeys(NAMES, GRID), np.zeros((2, 2), bool), {})
     for line in (figure.axes[0].xaxis, figure.axes[0].yaxis):
