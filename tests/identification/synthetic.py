@@ -7,6 +7,7 @@ SPIN_INERTIA = 1e-5  # of each wheel [kg m^2]
 
 
 def cross(a, b):
+    """Return the cross products of vectors (.., 3)."""
     return np.stack([
         a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1],
         a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2],
@@ -15,11 +16,13 @@ def cross(a, b):
 
 
 def multiply(p, q):
+    """Return the products of quaternions (.., 4), scalar last."""
     v = p[..., 3:] * q[..., :3] + q[..., 3:] * p[..., :3] + cross(p[..., :3], q[..., :3])
     return np.concatenate([v, p[..., 3:] * q[..., 3:] - np.sum(p[..., :3] * q[..., :3], -1, keepdims=True)], -1)
 
 
 def small(turn):
+    """Return the quaternions (.., 4) of rotation vectors (.., 3) [rad]."""
     angle = np.linalg.norm(turn, axis=-1, keepdims=True)
     return np.concatenate([0.5 * np.sinc(angle / (2.0 * np.pi)) * turn, np.cos(angle / 2.0)], -1)
 

@@ -22,7 +22,7 @@ ENTRIES = np.array([TRUE[i, j] for i, j in PAIRS])
 
 
 def satellite(free=("inertia", "gyro_bias"), **tables):
-    """A model whose inertia is up to 30 % off."""
+    """Return a scenario of a small satellite whose inertia is up to 30 % off `TRUE`."""
     return scenario.from_tables(
         {
             "spacecraft": {"inertia": [0.065, 0.072, 0.12]},
@@ -37,12 +37,14 @@ def satellite(free=("inertia", "gyro_bias"), **tables):
 
 
 def flight(rng, **others):
+    """Return an independently simulated log of the satellite with its true inertia, and its gyro bias [rad/s]."""
     (frame,), drift = synthetic.logs(rng, TRUE, dt=0.25, rows=257, wheels=True, lag=0.05, **others)
     return frame, drift[0]
 
 
 @pytest.fixture(scope="module")
 def identified():
+    """Return the result for a log with outliers and missing samples, and the true gyro bias."""
     rng = np.random.default_rng(5)
     frame, drift = flight(rng)
     found = explore.identify(satellite(), synthetic.spoiled(frame, rng), validate=[flight(rng)[0]])
@@ -68,7 +70,7 @@ def test_a_tenth_of_outliers_does_not_spoil_the_estimates():
     assert np.all(found.std < 0.02 * 0.11)  # the start is 30 % off
 
 
-def test_a_log_that_was_not_used_is_predicted(identified):
+def test_the_identified_model_predicts_a_log_that_was_not_used(identified):
     found, _ = identified
     (fit,) = found.validation
     assert fit.is_white
@@ -92,7 +94,7 @@ def test_the_identified_scenario_has_the_estimate_and_its_covariance(identified)
     assert abs(correlation - expected) < 0.1
 
 
-def test_the_summary_is_complete(identified):
+def test_the_summary_of_an_identification_has_status_parameters_and_logs(identified):
     found, _ = identified
     summary = results.summary(found)
     assert summary["status"] == "identified"
@@ -151,7 +153,7 @@ DISPERSED = {
 
 @pytest.fixture(scope="module")
 def disturbed():
-    """A log with a slow sinusoidal torque, whose phases are not those of the scenario."""
+    """Return a log with a slow sinusoidal torque, whose phases are not those of the scenario."""
     return flight(
         np.random.default_rng(7), disturbance=lambda t: TORQUE * np.sin(FREQUENCY * t + PHASES)
     )[0]  # fmt: skip
@@ -232,11 +234,13 @@ class ScriptedSearch(estimation.Search):
         self.tolerances = []
 
     def search_locally(self, z, acceleration):
+        """Return the next given result of a local search."""
         result = self.local.pop(0)
         self.acceleration_noise = result.acceleration_noise
         return result
 
     def _screen_and_maximise(self, z, screenings=1, tolerance=1e-3):
+        """Record the tolerance, and return or raise the next given result from a mirrored phase."""
         self.tolerances.append(tolerance)
         result = self.mirrored.pop(0)
         if isinstance(result, BaseException):
@@ -245,17 +249,20 @@ class ScriptedSearch(estimation.Search):
 
 
 def local_result(phase, log_likelihood, noise=0.0, mean_square=1.0):
+    """Return the result of a local search that converged to this phase [rad]."""
     return estimation.SearchResult(np.array([phase]), log_likelihood, np.eye(1), mean_square, True, 1, noise)
 
 
 @pytest.mark.parametrize(("gain", "noise"), [(5.0, 0.0), (9.0, 0.1)])
 def test_noise_on_the_acceleration_is_kept_only_for_a_large_gain_of_the_likelihood(gain, noise):
+    """The search compares a result with noise on the acceleration in the filter and a result without."""
     noisy, quiet = local_result(0.4, 100.0 + gain, 0.1), local_result(0.4, 100.0)
     search = ScriptedSearch([noisy, quiet], 2 * [local_result(2.7, 0.0)])
     assert search.find_best(np.zeros(1), 1.0, 2).acceleration_noise == noise
 
 
 def test_phases_of_a_better_starting_point_are_mirrored_too():
+    """A disturbance with the mirrored phase pi - p may be more likely than one with the phase p of a result."""
     first, second = local_result(0.4, 0.0, mean_square=9.0), local_result(-0.8, 100.0)
     mirrored = local_result(-2.3, 200.0)
     search = ScriptedSearch([first, second], [local_result(2.7, -1.0), mirrored, mirrored, second])
@@ -272,7 +279,7 @@ def test_only_a_mirrored_phase_that_is_more_likely_is_searched_with_the_full_acc
     assert [tolerance <= estimation.STEP_TOLERANCE for tolerance in search.tolerances] == [False, True, False]
 
 
-def test_a_second_starting_point_that_is_about_as_likely_is_the_last_one():
+def test_the_search_ends_after_a_second_starting_point_that_is_about_as_likely():
     noisy = [local_result(0.4, 100.0, 0.1), local_result(0.4, 97.0, 0.1), local_result(0.4, 500.0)]
     search = ScriptedSearch(noisy, 3 * [local_result(2.7, 0.0)])
     assert search.find_best(np.zeros(1), 1.0, 3).log_likelihood == 100.0
@@ -291,6 +298,7 @@ class RuggedSearch(ScriptedSearch):
     """A search whose likelihood increases at every sixth evaluation only, without end."""
 
     def derivatives(self, z, logs, *, exact=True):
+        """Return a likelihood that increases at every sixth evaluation, and constant derivatives."""
         self._evaluations += 1
         return float(self._evaluations) if self._evaluations % 6 == 1 else -1.0, np.ones(1), np.eye(1), 1.0
 
@@ -359,7 +367,7 @@ def test_a_proposed_manoeuvre_is_within_the_limits_and_as_accurate_as_expected()
     assert np.all(np.abs(found.estimate - ENTRIES) < 3.5 * proposed.std)
 
 
-def test_fast_rotation_is_integrated_accurately():
+def test_fast_rotation_of_a_log_is_integrated_accurately():
     rng = np.random.default_rng(1)
     (frame,), _ = synthetic.logs(rng, TRUE, dt=0.1, rows=300, wheels=True, lag=0.05, rate=(3.0, 2.0, -3.0))
     found = explore.identify(satellite(), frame)
@@ -369,6 +377,7 @@ def test_fast_rotation_is_integrated_accurately():
 
 @pytest.mark.parametrize("samples", [11, 20, 60, 300])
 def test_the_verdict_on_short_logs_is_calibrated(samples):
+    """Hardly any verdict on a right model is negative. Noise of twice the stated size is always detected."""
     rng, wrong, detected = np.random.default_rng(samples), 0, 0
     t, there = np.arange(samples + 1.0), np.ones((samples + 1, 6), bool)
     log = telemetry.Measurements("a log", t, {}, np.zeros((samples + 1, 3)))
@@ -385,7 +394,7 @@ def test_the_verdict_on_short_logs_is_calibrated(samples):
     assert detected == 200  # the noise is twice as large as in the model
 
 
-def test_every_value_of_the_coordinates_is_the_inertia_of_a_body():
+def test_every_value_of_the_search_coordinates_is_the_inertia_of_a_rigid_body():
     rng = np.random.default_rng(0)
     root = jnp.asarray(numbers.pseudo_root(np.diag([0.05, 0.09, 0.1399])))  # nearly flat
     many = jax.vmap(lambda c: numbers.from_coordinates(root, c))(3.0 * rng.standard_normal((500, 6)))
@@ -451,7 +460,7 @@ def test_prior_knowledge_determines_what_the_data_do_not():
 
 
 @pytest.mark.long
-def test_only_the_ratio_of_inertia_to_actuator_scale_is_determined():
+def test_identify_states_that_only_the_ratio_of_inertia_to_actuator_scale_is_determined():
     frame, _ = flight(np.random.default_rng(2))
     body = {"hardware": {"attitude_noise": 5e-5, "rate_noise": 1.4e-4, "torque_lag": 0.05}}
     found = explore.identify(satellite(("inertia", "actuator_scale", "gyro_bias"), **body), frame)
@@ -460,7 +469,7 @@ def test_only_the_ratio_of_inertia_to_actuator_scale_is_determined():
 
 
 @pytest.mark.long
-def test_wheel_speeds_replace_the_commanded_torque():
+def test_wheel_speeds_of_a_log_replace_its_commanded_torque():
     frame, _ = flight(np.random.default_rng(4))
     table = {"wheel_speed": ["speed1", "speed2", "speed3"], "wheel_inertia": synthetic.SPIN_INERTIA}
     found = explore.identify(satellite(telemetry=table), frame.drop("sent1", "sent2", "sent3"))
@@ -469,7 +478,7 @@ def test_wheel_speeds_replace_the_commanded_torque():
 
 
 @pytest.mark.long
-def test_a_mode_is_identified_from_a_simulated_run():
+def test_a_flexible_mode_is_identified_from_a_simulated_run():
     loaded = scenario.from_tables({
         "spacecraft": {"inertia": [4.0, 5.0, 6.0]},
         "flexible": {"frequency": [3.0], "damping": [0.0], "coupling": [[0.7, 0.0, 0.0]]},
@@ -606,7 +615,7 @@ def test_noise_of_a_star_tracker_is_about_its_own_axes():
         explore.identify(loaded, frame, free=["inertia", "gyro_scale"])
 
 
-def test_unknown_parameters_and_logs_that_differ_are_refused():
+def test_unknown_parameters_and_logs_with_different_readings_are_refused():
     frame, _ = flight(np.random.default_rng(2))
     with pytest.raises(ScenarioError, match=r"identify.free has inertias, which this scenario does not have; the near"):
         explore.identify(satellite(["inertias"]), frame)

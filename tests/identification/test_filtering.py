@@ -17,6 +17,7 @@ NOISE, WALK = (2e-3, 5e-3), 0.02
 
 
 def chain(free, **identify):
+    """Return the scenario of a noisy double integrator with these free parameters of [identify]."""
     return scenario.from_tables(
         {
             "plant": {"kind": "chain", "order": 2, "x0": [1.0, 0.0]},
@@ -49,6 +50,7 @@ def chain_log(rows=60, bias=0.3, walk=0.0, scale=1.0):
 
 
 def prepared(loaded, frame):
+    """Return the estimation problem of a scenario and its log, prepared for the filter."""
     log = telemetry.measurements(loaded, frame)
     problem = parameters.build(loaded, [log])
     return problem, estimation.prepare_log(problem, log)
@@ -226,7 +228,7 @@ def test_derivatives_without_those_of_the_covariance_are_good_enough_for_a_first
 
 
 def flexible_body():
-    """Two modes without motion, and their log with an interval of 0.1 ms."""
+    """Return the problem of a spacecraft with two modes, and its log at rest with an interval of 0.1 ms."""
     loaded = scenario.from_tables({
         "spacecraft": {"inertia": [4.0, 5.0, 6.0]},
         "flexible": {"frequency": [3.0, 4.0], "damping": [0.01, 0.01], "coupling": [[0.7, 0.0, 0.2], [0.0, -0.4, 0.1]]},
@@ -240,7 +242,7 @@ def flexible_body():
     return prepared(loaded, pl.DataFrame({"t": 1e-4 * np.arange(20), **still, **silent}))
 
 
-def test_noise_on_the_acceleration_moves_the_modes_too():
+def test_noise_on_the_acceleration_of_the_body_excites_the_flexible_modes_too():
     problem, (rows, kind) = flexible_body()
     model = replace(problem.model, acceleration_noise=jnp.asarray(0.3), hidden_sigma=jnp.zeros(4))
     _, track = filtering.run_filter(model, jax.tree.map(jnp.asarray, rows), kind)

@@ -20,6 +20,7 @@ RATE = np.stack([0.05 * np.sin(0.4 * T), 0.04 * np.cos(0.3 * T), 0.03 + 0.0 * T]
 
 
 def attitudes():
+    """Return attitudes (ROWS, 4), integrated from the body rate in fine steps."""
     turned = [Rotation.from_rotvec([0.1, -0.2, 0.3])]
     for k in range(ROWS - 1):
         fine = np.linspace(T[k], T[k + 1], 20)
@@ -35,6 +36,7 @@ Q = attitudes()
 
 
 def frame(**changes):
+    """Return a valid log; changes: columns to replace, or to remove if None."""
     columns = {"t": T}
     columns |= {f"measured_q{k + 1}": Q[:, k] for k in range(4)}
     columns |= {f"measured_w{k + 1}": RATE[:, k] for k in range(3)}
@@ -43,18 +45,20 @@ def frame(**changes):
 
 
 def loaded(**table):
+    """Return a scenario with this [telemetry] table."""
     wheels = {} if "wheel_speed" not in table and "wheel_torque" not in table else {"wheels": {"kind": "axes"}}
     sampled = {"loop": {"mode": "sampled"}, **wheels}
     return scenario.from_tables({**sampled, **({"telemetry": table} if table else {})})
 
 
 def with_value(column, row, value):
+    """Return the valid log with another value in one cell."""
     values = list(frame()[column])
     values[row] = value
     return frame(**{column: pl.Series(values, dtype=pl.String if isinstance(value, str) else pl.Float64, strict=False)})
 
 
-def test_orders_signs_units_and_blanks_give_the_same_log():
+def test_logs_with_other_quaternion_orders_signs_units_and_dates_are_read_alike():
     plain = telemetry.measurements(loaded(), frame())
     signs = np.where(np.arange(ROWS) % 3 == 0, -1.0, 1.0)
     other = frame(
@@ -75,7 +79,7 @@ def test_orders_signs_units_and_blanks_give_the_same_log():
     np.testing.assert_allclose(sign * again.readings["attitude"], plain.readings["attitude"], atol=1e-12)
 
 
-def test_blank_commands_hold_and_blank_readings_are_missing():
+def test_blank_commands_of_a_log_repeat_the_last_one_and_blank_readings_are_missing():
     q, u = [list(Q[:, k]) for k in range(4)], list(0.01 * np.cos(T))
     u[3] = None
     for column in q:
@@ -86,7 +90,7 @@ def test_blank_commands_hold_and_blank_readings_are_missing():
     assert log.command[3, 0] == log.command[2, 0]
 
 
-def test_an_attitude_with_an_age_gets_a_row_of_its_own():
+def test_an_attitude_with_an_age_gets_a_separate_row_at_the_time_of_its_measurement():
     log = telemetry.measurements(loaded(), frame(measured_age=np.full(ROWS, 0.2)))
     assert log.t[0] == 0.0
     there = ~np.isnan(log.readings["attitude"][:, 0])
@@ -96,7 +100,7 @@ def test_an_attitude_with_an_age_gets_a_row_of_its_own():
     np.testing.assert_allclose(log.t[rates][0] - log.t[there][0], 0.2, atol=1e-12)
 
 
-def test_wheel_speeds_in_rpm():
+def test_wheel_speeds_in_rpm_are_converted_to_rad_per_second():
     speeds = {f"n{k}": 100.0 * np.sin(0.1 * T + k) for k in range(3)}
     table = {"wheel_speed": ["n0", "n1", "n2"], "speed_unit": "rpm", "wheel_inertia": 1e-4}
     log = telemetry.measurements(loaded(**table), frame(**speeds))
@@ -142,7 +146,7 @@ BROKEN = [
 
 
 @pytest.mark.parametrize(("table", "rows", "words"), BROKEN, ids=[words[:40] for _, _, words in BROKEN])
-def test_a_broken_table_is_refused_in_one_sentence_with_row_and_column(table, rows, words):
+def test_a_log_with_invalid_cells_or_columns_is_refused_in_one_sentence(table, rows, words):
     with refuses(RefusedError, words):
         telemetry.measurements(loaded(**table), rows)
 
@@ -272,12 +276,12 @@ def test_torques_that_compensate_a_disturbance_are_accepted():
         ({"attitud": ["a"]}, "telemetry.attitud is not a known key"),
     ],
 )
-def test_a_contradictory_table_is_a_configuration_error(table, words):
+def test_a_contradictory_telemetry_table_is_a_configuration_error(table, words):
     with pytest.raises(ScenarioError, match=words.replace("[", r"\[")):
         scenario.from_tables({"loop": {"mode": "sampled"}, "wheels": {"kind": "axes"}, "telemetry": table})
 
 
-def test_files(tmp_path):
+def test_logs_are_read_from_csv_and_parquet_files_and_other_files_are_refused(tmp_path):
     frame().write_csv(tmp_path / "log.csv")
     frame().write_parquet(tmp_path / "log.parquet")
     both = [telemetry.measurements(loaded(), telemetry.read(tmp_path / f"log.{end}")) for end in ("csv", "parquet")]

@@ -50,7 +50,7 @@ def test_chain_of_order_2_has_the_law_of_the_second_order_system(eta, t):
 
 @pytest.mark.parametrize("n", short([2, 3, 4, 5, 6], [2, 5]))
 def test_surface_37_equals_its_definition_36(n):
-    """(36) is computed by nested automatic differentiation."""
+    """The numbers are equations of the paper. (36) is computed by nested automatic differentiation."""
     t_f, eta, t = 4.0, n + 0.7, 1.3
 
     def x(time):
@@ -112,7 +112,7 @@ EXACT = [(2, 5.0), (3, 30.0), (5, 0.7), (3, 5.0), (4, 5.0), (5, 5.0)]
 
 
 @pytest.mark.parametrize(("n", "t_f"), short(EXACT, EXACT[2:3]))
-def test_continuous_chain_equals_exact_solution_2(n, t_f):
+def test_simulated_continuous_chain_equals_its_exact_solution(n, t_f):
     """The tolerance, 1e-9 of the largest state, is the accuracy of the default time grid."""
     rng = np.random.default_rng(n)
     for eta in (n + 0.1, n + 1.0, n + 3.5):
@@ -215,11 +215,12 @@ test_many_chains_are_inside_their_envelopes = pytest.mark.long(
 
 @jax.jit
 def envelope(run, t, s0, floor):
+    """Return centre and half width of the envelopes of all states at times t, from constants of the envelope of s."""
     law = run.controller
     return jax.vmap(lambda time: solutions.state_envelope(time, law.t_f, law.eta, run.initial, s0, floor))(t)
 
 
-def test_envelopes_are_tight():
+def test_envelopes_of_a_chain_are_tight():
     """Without an estimation error |s| equals its envelope, and x_1 comes within 1 % of its envelope."""
     run = chain_parts([1.0, 0.5, 0.0], 5.0, 4.0, bound=0.0)
     log = fly(run).log
@@ -239,7 +240,7 @@ def test_bound_on_s_does_not_overflow_if_its_square_would():
     np.testing.assert_allclose(far, 1e153 * one, rtol=1e-12)
 
 
-def test_exact_chain_of_order_2_equals_exact_error():
+def test_exact_solution_of_a_chain_of_order_2_equals_that_of_the_second_order_system():
     for t in (0.0, 1.0, 6.9):
         both = solutions.exact_error(vector(t), vector(7.0), vector(2.7), vector([0.7]), vector([-0.3]))
         chain = solutions.exact_chain(vector(t), vector(7.0), vector(2.7), vector([0.7, -0.3]))
@@ -248,7 +249,7 @@ def test_exact_chain_of_order_2_equals_exact_error():
 
 
 @pytest.mark.parametrize("n", [2, 3, 4, 5])
-def test_exact_chain_solves_the_equations_of_chain_and_law(n):
+def test_exact_solution_of_a_chain_solves_the_equations_of_chain_and_law(n):
     """The derivative of each state is the next state, and the last one is the input of the law."""
     run = chain_parts(np.random.default_rng(n).normal(size=n), 7.0, n + 0.8)
     law = run.controller

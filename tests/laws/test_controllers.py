@@ -36,6 +36,7 @@ SPIN = references.Spin(vector(0.1, -0.2, 0.1, np.sqrt(1 - 0.06)), vector(0.02, -
 
 
 def state(seed: int) -> AttitudeState:
+    """Return a random attitude and body rate."""
     rng = np.random.default_rng(seed)
     q = rng.normal(size=4)
     q[3] = abs(q[3]) + 0.5
@@ -104,7 +105,7 @@ def test_sign_width_0_is_the_discontinuous_sign():
     np.testing.assert_array_equal(discontinuous, thin_layer)
 
 
-def test_align_chooses_the_sign_of_the_reference_and_clearance_is_positive_there():
+def test_align_chooses_the_sign_of_q_with_a_positive_distance_to_the_singularity():
     law = parts().controller
     x = state(4)
     for flip_x in (1.0, -1.0):

@@ -59,7 +59,7 @@ def build_law(name, error: Any = ChainKinematics, model: Any = CHAIN, t_f=T_F, d
 
 @jax.jit
 def evaluate(law, memory, now, error, rate, bound):
-    """Return acceleration, sliding variable and the next memory."""
+    """Return acceleration, sliding variable and the next memory of a law."""
     a, s, *memories = law.acceleration(now._replace(memory=memory), error, rate, bound)
     return a, s, memories[0] if memories else memory
 
@@ -68,6 +68,7 @@ def evaluate(law, memory, now, error, rate, bound):
 
 
 def sig(x, power):
+    """Return sign(x) |x|^power."""
     return np.sign(x) * np.abs(x) ** power
 
 
@@ -98,7 +99,7 @@ def phi_derivative(x, q, settling):
 
 
 def law_in_numpy(name, gains, now, e, w, bound, memory=None, profile=None):
-    """Return acceleration, sliding variable and the next memory. now: time, hold, length of the period."""
+    """Return acceleration, sliding variable and next memory of a law. now: time, hold, length of the period."""
     (t, hold, dt), g = now, gains
 
     def sign(s):
@@ -206,7 +207,7 @@ SHORT_PAIRS = [case for case in PAIRS if case[0] == "attitude" or case[1] == "ti
 
 
 @pytest.mark.parametrize(("plant", "name"), helpers.short(PAIRS, SHORT_PAIRS))
-def test_input_produces_the_acceleration_of_the_error_that_the_paper_of_the_law_states(plant, name):
+def test_input_of_a_law_gives_the_acceleration_of_the_error_that_its_paper_states(plant, name):
     error, model, reference, x, d, start, rate = PLANTS[plant]
     law = build_law(name, error, model)
     e, w, bound = independent_error(plant, x, d)
@@ -238,7 +239,7 @@ TIMES = ((0.0, False), (1.3, False), (T_F - DELTA, True), (T_F, True), (T_F + 1.
 
 
 @pytest.mark.parametrize("name", CLASSES)
-def test_derivatives_by_gains_errors_and_memory_equal_finite_differences(name):
+def test_derivatives_of_laws_by_gains_errors_and_memory_equal_finite_differences(name):
     law, now = build_law(name), Sample(vector(1.3), APPROACH, vector(0.1))
     first = evaluate(law, law.begin(), NOW, *(vector([v]) for v in (0.9, -0.1)), vector(0.05))[2]
     inputs = ({key: getattr(law, key) for key in (*GAINS[name], "t_f")}, first, *POINTS[0])
@@ -257,7 +258,7 @@ def test_derivatives_by_gains_errors_and_memory_equal_finite_differences(name):
 
 
 @pytest.mark.parametrize("name", CLASSES)
-def test_values_and_gradients_are_finite_at_zero_norms_roots_and_remaining_times(name):
+def test_values_and_gradients_of_laws_are_finite_at_zero_norms_roots_and_remaining_times(name):
     @jax.jit
     def gradients_and_values(law, t, hold, e, w):
         return jax.jacrev(
@@ -356,7 +357,7 @@ def test_derivatives_of_a_run_include_the_memory_of_the_law(name):
 # ---- time base generators
 
 
-def test_profile_is_the_quintic_from_the_measured_error_to_rest():
+def test_time_base_profile_is_the_quintic_from_the_measured_error_to_rest():
     law, start = build_law("time_base_pd"), time_base.ProfileStart(jnp.ones(()), vector([1.4]), vector([-0.3]))
     profile = jax.jit(law.profile)
     for t in (0.0, 0.4, 2.5, 4.9, T_F, T_F + 1.0):
@@ -399,7 +400,7 @@ def test_rotation_vector_equals_twice_the_arc_sine():
 
 
 @pytest.mark.parametrize("no_feedback", [False, True])
-def test_profile_starts_at_the_first_measured_error_and_does_not_change(no_feedback):
+def test_time_base_profile_starts_at_the_first_measured_error_and_does_not_change(no_feedback):
     gains = {"k_p": 1e-13, "k_d": 1e-13} if no_feedback else {}
     law = build_law("time_base_pd", delta=0.495, **gains)  # the first period is half as long
     run = chain_run(law, START, noise=0.05)

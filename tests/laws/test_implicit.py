@@ -108,7 +108,7 @@ def test_implicit_sampling_has_50_times_less_chattering_than_the_discontinuous_s
 
 
 @pytest.mark.parametrize("order", [2, 3])
-def test_derivatives_equal_finite_differences(order):
+def test_derivatives_of_the_window_error_equal_finite_differences(order):
     """Central differences with a step of 1e-6 have a truncation error of 1e-12 and a rounding error of 1e-10."""
     parts, step = with_longer_clock(chain_parts(order, bound=0.01, disturbance=0.005)), 1e-6
     at, names = np.array([order + 0.7, 0.43, 1.3, T_F]), ("eta", "delta", "k1", "t_f")
@@ -149,7 +149,7 @@ def test_implicit_gains_equal_the_jacobian_of_the_law_and_are_stable_for_any_del
     assert 0.0 < delayed[0] < delayed[1]
 
 
-def test_hold_phase_has_no_largest_k1_without_delay():
+def test_implicit_sampling_has_no_largest_k1_without_delay():
     assert stability_limits.largest_reaching(0.05, implicit=True) == np.inf
     delayed = [stability_limits.largest_reaching(0.05, 1.0, implicit=implicit) for implicit in (True, False)]
     assert delayed[0] > delayed[1]

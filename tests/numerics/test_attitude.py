@@ -21,6 +21,7 @@ multiply_all = jax.jit(jax.vmap(attitude.multiply))
 
 
 def skew(v):
+    """Return the cross-product matrix of a vector."""
     return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
 
 
@@ -51,7 +52,7 @@ def test_conjugate_is_the_inverse():
     np.testing.assert_allclose(identity, np.tile([0, 0, 0, 1], (24, 1)), rtol=0, atol=8 * EPS)
 
 
-def test_normalise_preserves_direction():
+def test_normalise_divides_a_quaternion_by_its_norm():
     got = jax.vmap(attitude.normalise)(vector(3e-3 * P))
     np.testing.assert_allclose(got, P / np.linalg.norm(P, axis=1, keepdims=True), rtol=0, atol=4 * EPS)
 
@@ -75,7 +76,7 @@ def test_t_inverse_times_equals_linear_solve(scale):
         np.testing.assert_allclose(got, expected, rtol=0, atol=tolerance)
 
 
-def test_derivative_equals_finite_differences_of_a_rotating_body():
+def test_derivative_of_a_quaternion_equals_finite_differences_of_a_rotating_body():
     # Richardson extrapolation of central differences of q exp(w t): truncation (|w| h / 2)^4, rounding eps / h
     h = 1e-3
     for q, w in zip(P, W, strict=True):

@@ -18,6 +18,7 @@ from tests.tree import modules
 
 
 def threefry(key, counter):
+    """Return the two output words of Threefry-2x32 with 20 rounds."""
     mask, turns = 0xFFFFFFFF, (13, 15, 26, 6, 17, 29, 16, 24)
     parity = 0x1BD11BDA ^ key[0] ^ key[1]
     schedule = [key[0], key[1], parity]
@@ -32,6 +33,7 @@ def threefry(key, counter):
 
 
 def expected(seed, trial, name, sample, count):
+    """Return `count` uniform and normal numbers of a stream by the documented rule."""
     key = threefry((seed, 0), (trial, zlib.crc32(name.encode())))
     pairs = [threefry(key, (sample % 2**32, block)) for block in range(-(-count // 2))]
     uniforms, normals = [], []
@@ -43,6 +45,7 @@ def expected(seed, trial, name, sample, count):
 
 
 def words(*values):
+    """Return the values as unsigned 32-bit numbers of JAX."""
     return [jnp.uint32(value) for value in values]
 
 
@@ -68,7 +71,7 @@ CASES = [
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_numbers_follow_the_documented_rule(case):
+def test_random_numbers_follow_the_documented_rule(case):
     seed, trial, name, sample, count = case
     key = draws.stream(seed, trial, name)
     assert (int(key.a), int(key.b)) == threefry((seed, 0), (trial, zlib.crc32(name.encode())))
@@ -78,7 +81,7 @@ def test_numbers_follow_the_documented_rule(case):
     np.testing.assert_allclose(draws.normals(key, count, sample), normals, rtol=0, atol=1e-14)
 
 
-def test_streams_that_are_drawn_together_equal_single_streams():
+def test_random_streams_that_are_drawn_together_equal_single_streams():
     names, counts = ["rate_noise", "", "attitude_noise"], [1, 5, 4]
     keys = draws.streams(2**32 - 1, 7, names)
     assert keys == [draws.stream(2**32 - 1, 7, name) for name in names]
@@ -88,7 +91,7 @@ def test_streams_that_are_drawn_together_equal_single_streams():
             np.testing.assert_allclose(found[name], expected(2**32 - 1, 7, name, 0, count)[k], rtol=0, atol=1e-14)
 
 
-def test_derived_seed_is_the_first_word_of_a_stream():
+def test_derived_seed_is_the_first_word_of_a_random_stream():
     for seed, name in ((0, "fresh trials"), (2**32 - 1, "x")):
         got = draws.derive(seed, name)
         assert got == threefry((seed, 0), (0, zlib.crc32(name.encode())))[0]
@@ -108,7 +111,7 @@ def test_seed_and_trial_may_have_any_integer_dtype():
         assert draws.stream(kind(2**32 - 5), kind(2**31 + 1), "name") == expected_key
 
 
-def test_numbers_do_not_depend_on_the_batch():
+def test_random_numbers_do_not_depend_on_the_batch():
     def one(trial, sample):
         key = draws.stream(11, trial, "rate_noise")
         return draws.uniforms(key, 3, sample), draws.normals(key, 5, sample)
@@ -142,7 +145,7 @@ SENSORS = ("devices.sensors", "devices.sensor_suite")  # a run has one of the tw
 
 
 def stream_names():
-    """Return a list of the stream names in all calls of `draws`. A name that two calls use is in the list twice.
+    """Return a list of the names of random streams in all calls of `draws`, twice if two calls use a name.
 
     Names in the two modules of sensors count once. The export is left out, because it must use the streams of the
     simulation.
@@ -154,7 +157,7 @@ def stream_names():
 
 
 def module_stream_names(module, path):
-    """Return the stream names in the calls of `draws` in one module, with the values of its constants."""
+    """Return the names of random streams in the calls of `draws` in one module, with the values of its constants."""
     source, names = path.read_text(), []
     if "draws." not in source:
         return names

@@ -24,6 +24,8 @@ EPS = np.finfo(float).eps
 
 @dataclass(frozen=True)
 class _Law:
+    """A law with a static field."""
+
     gain: Any
     model: Any
     order: int = field(metadata={"static": True})
@@ -50,6 +52,8 @@ def test_classes_with_the_same_fields_have_different_tree_structures():
 
 
 class _State(NamedTuple):
+    """Attitude and body rate."""
+
     q: Any
     w: Any
 
@@ -57,6 +61,8 @@ class _State(NamedTuple):
 @pytrees.pytree
 @dataclass(frozen=True)
 class _Observer:
+    """An observer whose model may be None."""
+
     gain: Any
     model: Any = None
 
@@ -64,6 +70,8 @@ class _Observer:
 @pytrees.pytree
 @dataclass(frozen=True)
 class _Run:
+    """A tree of nested classes. The tests replace its values by path."""
+
     observer: _Observer
     initial: _State
 
@@ -168,11 +176,14 @@ def test_select_ignores_the_tangent_of_the_other_value():
 
 
 def convergence_orders(errors):
+    """Return the orders of convergence, from errors of step sizes that are halved each time."""
     return np.log2(np.asarray(errors)[:-1] / np.asarray(errors)[1:])
 
 
 @partial(jax.jit, static_argnames=("step", "count"))
 def integrate(step, y, end, count):
+    """Integrate from t = 0 to `end` in `count` steps and return the last state."""
+
     def advance(y, k):
         return step(k * (end / count), y, end / count), None
 
@@ -215,7 +226,7 @@ def test_rk4_converges_with_order_4():
 
 
 def phi_exact(x, order, differentiate=False):
-    """Return phi_order of a number, or its derivative, with 100 digits: phi_k' = (phi_(k-1)' - phi_k) / x."""
+    """Return phi_k of a number for k = order, or its derivative, with 100 digits: phi_k' = (phi_(k-1)' - phi_k) / x."""
     if x == 0.0:
         return 1 / math.factorial(order + differentiate)
     with localcontext() as context:
@@ -287,6 +298,7 @@ def test_phi_functions_of_general_matrices_are_accurate(size):
 
 
 def phi_entries(rate):
+    """Return phi_0 to phi_3 (4,) of the number -rate, computed with a matrix."""
     return jnp.stack([phi[0, 0] for phi in integrators.phi_functions(-rate * jnp.eye(2), 3)])
 
 
@@ -353,12 +365,12 @@ decay = jax.jit(integrators.decay)
 
 @jax.jit
 def step_with_constant_forcing(linear, m, g, dt):
-    """Return y and m after a step with the constant forcing g."""
+    """Return y and m after an ETDRK4 step with the constant forcing g."""
     return integrators.etdrk4(lambda t, y, m: (jnp.zeros(1), g, None), linear, jnp.zeros(()), jnp.zeros(1), m, dt)[:2]
 
 
 def step_with_cosine_forcing(t, y, dt):
-    """Return y and m after a step with the forcing cos t; the coefficients are part of the state."""
+    """Return y and m after an ETDRK4 step with the forcing cos t; the coefficients are part of the state."""
     y, m, linear = y
     step = integrators.etdrk4(lambda t, y, m: (jnp.zeros(1), jnp.cos(t)[None], None), linear, t, y, m, dt)
     return *step[:2], linear
@@ -386,7 +398,7 @@ def test_etdrk4_is_accurate_for_smooth_forcing_at_any_stiffness(rate):
     assert abs(end - exact) <= 0.05**3 / 124 * min(1 / rate, 5.0) + 200 * EPS * min(1 / rate, 5.0)
 
 
-def test_etdrk4_returns_aux_of_its_first_stage():
+def test_etdrk4_returns_the_auxiliary_output_of_its_first_stage():
     arguments = vector(0.7), vector([0.3, -1.1]), vector([0.2])
     linear = integrators.decay(vector([[0.5]]), vector(0.4))
     *_, aux = integrators.etdrk4(lambda t, y, m: (y - t, m * m, (t, y, m)), linear, *arguments, vector(0.4))
@@ -397,6 +409,7 @@ def test_etdrk4_returns_aux_of_its_first_stage():
 @jax.jit
 @partial(jax.grad, argnums=(0, 1))
 def step_derivatives(rate, dt):
+    """Return the derivatives of an ETDRK4 step by decay rate and step length."""
     linear = integrators.decay(rate * jnp.eye(2), dt)
     return integrators.etdrk4(
         lambda t, y, m: (m, vector([0.3, -0.4]), None), linear, vector(0.0), jnp.zeros(2), vector([1.0, 2.0]), dt
@@ -455,7 +468,7 @@ def test_derivative_of_solve_equals_closed_form():
 
 
 @pytest.mark.parametrize("width", [0.0, 1e-3])
-def test_signed_root_and_its_derivative_at_zero(width):
+def test_signed_root_equals_its_closed_form_and_has_a_finite_derivative_at_zero(width):
     x = vector(np.array([-4.0, -1e-3, 0.0, 1e-9, 0.25]))
     got = guards.signed_root(x, vector(width))
     exact = np.asarray(x) / np.where(np.asarray(x) == 0, 1.0, (np.asarray(x) ** 2 + width**2) ** 0.25)

@@ -17,7 +17,7 @@ OUTER = {"state": (X0, jnp.asarray(0.5))}
 
 
 def pendulum(carry, t):
-    """A step with outputs of several dtypes and shapes, a Python number, None and an empty array."""
+    """Return the next state of a pendulum, with outputs of several dtypes and shapes, None and an empty array."""
     x, v = carry["state"]
     v = v - 0.1 * jnp.sin(x[0]) + 0.01 * t
     count = t.astype(jnp.int32)
@@ -31,7 +31,7 @@ def pendulum(carry, t):
 
 
 @pytest.mark.parametrize("options", [{}, {"reverse": True}, {"length": 7, "unroll": 2}])
-def test_outputs_equal_lax_scan(options):
+def test_outputs_of_stacking_scan_equal_lax_scan(options):
     ours, theirs = stacking.scan(pendulum, OUTER, TIMES, **options), jax.lax.scan(pendulum, OUTER, TIMES, **options)
     assert jax.tree.structure(ours) == jax.tree.structure(theirs)
     for one, other in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
@@ -39,14 +39,14 @@ def test_outputs_equal_lax_scan(options):
         np.testing.assert_array_equal(one, other)
 
 
-def test_scan_without_steps_or_without_outputs():
+def test_stacking_scan_works_without_steps_and_without_outputs():
     (outputs, *_), length = stacking.scan(pendulum, OUTER, TIMES[:0])[1], len(TIMES)
     assert outputs["outer"].shape == (0, 3, 3)
     last, nothing = stacking.scan(lambda x, _: (2.0 * x, None), 1.0, None, length=length)
     assert (last, nothing) == (2.0**length, None)
 
 
-def test_disable_jit_falls_back_to_lax_scan():
+def test_stacking_scan_falls_back_to_lax_scan_if_jit_is_disabled():
     """Regression: outputs whose weak type changes after the first step, and random keys, raised errors."""
 
     def step(c, t):
@@ -59,6 +59,8 @@ def test_disable_jit_falls_back_to_lax_scan():
 
 
 def gradients_of(scan):
+    """Return derivatives and batched values (9,) of a function that uses this scan."""
+
     def error(gain):
         (_, (outputs, *_)) = scan(lambda c, t: pendulum(c, gain * t), OUTER, TIMES)
         return jnp.sum(outputs["outer"] ** 2)
@@ -66,7 +68,7 @@ def gradients_of(scan):
     return jnp.stack([jax.grad(error)(1.3), jax.jacfwd(error)(1.3), *jax.vmap(error)(TIMES)])
 
 
-def test_scan_composes_with_grad_jacfwd_and_vmap():
+def test_stacking_scan_composes_with_grad_jacfwd_and_vmap():
     found, expected = jax.jit(lambda: (gradients_of(stacking.scan), gradients_of(jax.lax.scan)))()
     np.testing.assert_allclose(found, expected, rtol=1e-12)
     with jax.checking_leaks():

@@ -90,7 +90,7 @@ def test_most_extreme_lists_failed_trials_first_then_the_worst_values():
     assert statistics.most_extreme(values, failed, 4, larger_is_better=True).tolist() == [3, 1, 0, 2]
 
 
-def test_mean_bound_is_between_the_mean_and_1():
+def test_upper_mean_bound_of_fractions_is_between_their_mean_and_1():
     """This also holds if nearly all numbers are 1, or differ from 0 or 1 by rounding errors."""
     few, off = np.append(np.ones(40), [0.5, 0.9]), np.append(np.ones(9), 1.0 + 2e-16)
     for fractions in (few, off, np.append(-1e-17, np.zeros(3)), np.full(9, 1.0 - 1e-13), np.ones(4), np.array([0.3])):
@@ -199,7 +199,7 @@ def test_influential_category_is_detected_with_few_trials_and_an_unrelated_one_i
     assert false <= 4  # 0.8 are expected
 
 
-def test_inputs_that_rank_the_trials_alike_are_one_driver():
+def test_inputs_that_rank_the_trials_alike_are_listed_as_one_driver():
     rng = np.random.default_rng(0)
     angle, other = rng.uniform(0.3, 2.4, 1000), rng.normal(size=1000)
     inputs = {"initial_angle": angle, "initial_q4": np.cos(angle / 2), "other": other}
