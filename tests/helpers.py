@@ -121,7 +121,7 @@ def untuned(text: str) -> dict[str, Any]:
 
 
 def roomy(timing: Any) -> Any:
-    """Return the clock with more steps, or periods of length zero, so that runs with other times share one program."""
+    """Return the clock with more steps, or periods of length zero, so that different runs share a compiled program."""
     counts = {name: getattr(timing, name) for name in (("count",) if timing.sampled else ("before", "after"))}
     more = {name: count if count > 1024 else 512 if count <= 512 else 1024 for name, count in counts.items()}
     return dataclasses.replace(timing, **more)
@@ -147,7 +147,7 @@ errors_along = jax.jit(jax.vmap(solutions.exact_error, (0, None, None, None, Non
 
 
 def vector(*values: Any) -> Any:
-    """Return a float64 array."""
+    """Return a float64 array of several numbers or of one sequence."""
     return jnp.asarray(np.asarray(values[0] if len(values) == 1 else values, dtype=float), dtype=float)
 
 
@@ -282,7 +282,7 @@ def with_controller(run: Parts, **changes: Any) -> Parts:
 
 
 def finer(run: Parts, times: int) -> Parts:
-    """Return the same run on a grid with `times` as many steps."""
+    """Return the same run on a time grid with `times` as many steps."""
     grid = run.clock
     assert isinstance(grid, clock.Graded)
     grid = dataclasses.replace(
@@ -318,7 +318,7 @@ def refuses(error, said):
 
 
 def rows_of(folder):
-    """Return the rows of a campaign."""
+    """Return the rows of all trials in the folder of a campaign."""
     return pl.concat([pl.read_parquet(path) for path in sorted((folder / "trials").glob("*.parquet"))])
 
 
@@ -364,7 +364,7 @@ def gpus() -> list[Any]:
 
 
 class _CalledError(Exception):
-    pass
+    """Raised by the replaced program of `assert_prepared`, to end the call."""
 
 
 def assert_prepared(monkeypatch, owner, program, prepare, call):

@@ -13,7 +13,7 @@ NOISES = [(8.0, 8.0, 40.0), (12.0, 10.0, 60.0)]  # [arcsec]
 
 
 def star_tracker(k, interval, latency, period):
-    """Return the k-th star tracker."""
+    """Return star tracker 0 or 1; sample interval, latency and control period [s]."""
     mounting = attitude.from_rotation_vector(vector(MOUNTINGS[k]))
     times = attitude_sensors.sample_times(interval, latency, period)
     noise = ARCSEC * jnp.asarray(NOISES[k])

@@ -36,7 +36,7 @@ def test_invalid_bits_and_devices_are_refused(asked):
 
 
 @pytest.mark.parametrize("said", ["", "elsewhere"])
-def test_the_cache_folder_follows_the_xdg_standard(tmp_path, monkeypatch, said):
+def test_the_folder_of_the_compile_cache_follows_the_xdg_standard(tmp_path, monkeypatch, said):
     """The folder is in $XDG_CACHE_HOME, or in ~/.cache if the variable is not set or empty."""
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / said) if said else "")
@@ -45,7 +45,7 @@ def test_the_cache_folder_follows_the_xdg_standard(tmp_path, monkeypatch, said):
     assert folder.parent == tmp_path / (said or ".cache") / "ptsmc-jax"
 
 
-def test_a_user_without_a_home_has_no_cache(monkeypatch):
+def test_a_user_without_a_home_folder_has_no_compile_cache(monkeypatch):
     """A container may run under a user number without an entry in /etc/passwd."""
 
     def unknown():
@@ -69,7 +69,9 @@ LEVEL = "--xla_backend_optimization_level"
         ("0.10", "x86_64", "gpu", ["--xla_cpu_prefer_vector_width=512"], ["-unroll-runtime=false", f"{LEVEL}=1"]),
     ],
 )
-def test_options_depend_on_version_machine_and_device(monkeypatch, jaxlib, machine, device, included, excluded):
+def test_compiler_options_depend_on_version_machine_and_device(
+    monkeypatch, jaxlib, machine, device, included, excluded
+):
     monkeypatch.setattr(setup, "JAXLIB", jaxlib)
     monkeypatch.setattr(setup, "MACHINE", machine)
     options = setup._compiler_options(device)
@@ -78,18 +80,18 @@ def test_options_depend_on_version_machine_and_device(monkeypatch, jaxlib, machi
 
 
 @pytest.mark.parametrize("plug_in", [None, "a plug-in"])
-def test_a_gpu_may_be_used_if_a_plug_in_is_installed(monkeypatch, plug_in):
+def test_default_compiler_options_are_for_a_gpu_if_a_plug_in_of_jax_is_installed(monkeypatch, plug_in):
     monkeypatch.setattr(setup.importlib.util, "find_spec", lambda name: plug_in)
     assert setup._compiler_options(None) == setup._compiler_options("gpu" if plug_in else "cpu")
 
 
-def test_an_unknown_machine_gets_no_options_and_a_warning(monkeypatch):
+def test_an_unknown_machine_gets_no_compiler_options_and_a_warning(monkeypatch):
     monkeypatch.setattr(setup, "MACHINE", "riscv64")
     with pytest.warns(RuntimeWarning, match="no compiler options are known for jaxlib .* on riscv64"):
         assert setup._compiler_options("cpu") == ()
 
 
-def test_options_are_written_as_xla_reads_them():
+def test_compiler_options_are_written_in_the_format_of_xla_flags():
     assert setup._merge_flags("", ("a=1", "--b=2", "-c=3")) == f"{EXTRA}=a=1,-c=3 --b=2"
     assert setup._merge_flags("", ()) == ""
 
@@ -98,7 +100,7 @@ def test_options_are_written_as_xla_reads_them():
     "user",
     ["", f"{LEVEL}=3", "--xla_cpu_enable_fast_math=false", f"{EXTRA}=x=1", "--xla_disable_hlo_passes=", "a/file"],
 )
-def test_options_of_the_user_take_precedence(user):
+def test_compiler_options_of_the_user_take_precedence(user):
     """XLA uses the last of two equal options. No option is added to a decisive option or a file of the user."""
     flags = setup._merge_flags(user, ALL)
     assert flags.startswith(user)
@@ -112,7 +114,7 @@ def test_options_of_the_user_take_precedence(user):
 @pytest.mark.parametrize(
     "case", ["written by a group", "written by all", "of somebody else", "a link", "a file", "closed"]
 )
-def test_a_cache_that_other_users_can_write_is_not_used(tmp_path, monkeypatch, case):
+def test_a_compile_cache_that_other_users_can_write_is_not_used(tmp_path, monkeypatch, case):
     """Loading an entry runs machine code, so other users must not write it."""
     folder = tmp_path / "cache"
     (tmp_path / "elsewhere").mkdir(mode=0o700)
@@ -135,13 +137,13 @@ def test_a_cache_that_other_users_can_write_is_not_used(tmp_path, monkeypatch, c
         assert setup._check_cache_folder(folder) is None
 
 
-def test_a_new_cache_is_closed_to_others_and_used_again(tmp_path):
+def test_a_new_compile_cache_is_closed_to_other_users_and_used_again(tmp_path):
     for _ in range(2):
         assert setup._check_cache_folder(tmp_path / "a" / "cache") == tmp_path / "a" / "cache"
     assert (tmp_path / "a" / "cache").stat().st_mode & 0o777 == 0o700
 
 
-def test_a_read_only_cache_causes_one_warning(tmp_path, monkeypatch):
+def test_a_read_only_compile_cache_causes_one_warning(tmp_path, monkeypatch):
     """JAX itself would warn for each entry."""
     monkeypatch.setattr(setup.os, "access", lambda *_: False)
     with warnings.catch_warnings(record=True) as shown:
@@ -153,7 +155,7 @@ def test_a_read_only_cache_causes_one_warning(tmp_path, monkeypatch):
     assert [str(one.message).endswith("takes no new entries") for one in shown] == [True, False]
 
 
-def test_the_options_of_this_version_and_machine_change_no_result():
+def test_the_compiler_options_of_this_version_and_machine_change_no_result():
     """The test needs a separate process, because XLA ends a process that sets an unknown option."""
 
     def tried(options):
@@ -259,7 +261,7 @@ def told(tmp_path_factory):
     return json.loads(done.stdout)
 
 
-def test_a_second_call_with_the_same_arguments_does_nothing(told):
+def test_a_second_call_of_configure_with_the_same_arguments_does_nothing(told):
     assert told["second"] == [True, 7.0]
 
 
@@ -275,7 +277,7 @@ def test_compiler_options_can_change_only_before_jax_runs(told):
     assert "than fast=False asks for" in told["refused"]
 
 
-def test_truncated_cache_entries_are_compiled_again(told):
+def test_programs_with_truncated_cache_entries_are_compiled_again(told):
     """A process that starts at the same time can see truncated entries. It must not warn."""
     assert (told["found"], told["cut"]) == ([7.0, 7.0], True)
 

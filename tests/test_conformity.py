@@ -217,7 +217,7 @@ CASES = [pytest.param(name, name in IN_FULL, id=name) for name in KINDS] + [
         ("disturbance", DISTURBANCES["spacecraft"]),
     ],
 )
-def test_every_kind_has_a_row(name, known):
+def test_every_kind_of_law_observer_reference_and_disturbance_is_in_a_tested_scenario(name, known):
     asked = [row.get(name, {}) for row in ROWS.values()]
     asked += [term for table in asked for term in table.get("terms", ())]
     assert {table.get("kind", next(iter(known))) for table in asked} >= set(known) - {"none"}
@@ -225,9 +225,9 @@ def test_every_kind_has_a_row(name, known):
 
 @programs.jit(static_argnames=("in_lanes", "sloped"))
 def batch(parts, still, dispersion, in_lanes, sloped):
-    """Return metrics, status and bad times of some trials, and gradients of metrics in the law's gains.
+    """Return metrics, statuses and failure times of some trials, and derivatives of the metrics along all gains.
 
-    The last trial is `still`.
+    The last trial has the initial state and boundary layer of `still`.
     """
     vmap = lanes.vmap if in_lanes else jax.vmap  # pytest raises the warning of a primitive without a rule
     names = [name for name in parts.controller.tunable if name not in ("sign_width", "t_f", "k1")]
@@ -277,7 +277,7 @@ def agree(values, wanted, unit, name, skip=()):
 
 
 def one_by_one(parts, still, dispersion, sloped):
-    """Do the same as `batch` in a loop, without gradients. Its program compiles in half the time."""
+    """Return the results of `batch` from single simulations, without gradients. They compile in half the time."""
     assert not sloped
     begun = [drawn(dispersion, parts, trial) for trial in (*NUMBERS, np.uint32(NUMBERS.size))]
     begun[-1] = replace(begun[-1], initial=still.initial)
@@ -296,7 +296,10 @@ under_vmap = partial(batch, in_lanes=False)
 
 
 def compare(parts, dispersion, name, sloped, reference: Any = under_vmap):
-    """Compare lanes with vmap: metrics of the trials, and status, metrics and gradients of the special trial."""
+    """Assert that lanes and a reference give equal results of all trials; the last trial is at rest on the target.
+
+    Returns metrics of the other trials, and status, metrics and gradients of the last trial, all from the reference.
+    """
     still, by_lanes = at_rest_on_the_target(parts), partial(batch, in_lanes=True)
     both = [jax.tree.map(np.asarray, of(parts, still, dispersion, sloped=sloped)) for of in (by_lanes, reference)]
     got, expected = (jax.tree.map(lambda v: v[:-1], one) for one in both)

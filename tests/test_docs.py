@@ -108,7 +108,7 @@ def test_the_guides_name_every_command():
 
 
 @pytest.mark.parametrize("path", WRITTEN, ids=page_name)
-def test_commands_in_the_text_exist(path):
+def test_commands_in_the_documentation_exist(path):
     """The command line accepts each call of ptsmc in shell blocks and in the text."""
     lines = [line.split("#")[0].strip() for block in blocks(path, "", "bash", "console") for line in block.splitlines()]
     calls = [line.removeprefix(".venv/bin/") for line in lines if re.match(r"(\.venv/bin/)?ptsmc ", line)]
@@ -126,7 +126,7 @@ def test_commands_in_the_text_exist(path):
 
 
 @pytest.mark.parametrize("path", [page for page in WRITTEN if blocks(page, "toml")], ids=page_name)
-def test_scenarios_in_the_text_are_valid(path, tmp_path, monkeypatch):
+def test_scenarios_in_the_documentation_are_valid(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for block in blocks(path, "python"):
         if "pendulum = system(" in block:
@@ -141,7 +141,7 @@ def test_scenarios_in_the_text_are_valid(path, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("path", WRITTEN, ids=page_name)
-def test_names_in_the_text_exist(path):
+def test_names_in_the_documentation_exist(path):
     """The text names existing modules, functions and files of the project."""
     text = FENCE.sub("", path.read_text())
     for place, name in re.findall(r"`((?:[a-z_\d]+\.)+)([A-Za-z_]\w*)(?:\([^`]*\))?`", text):
@@ -167,7 +167,7 @@ LARGE = [page for page in CODED if page.name in ("README.md", "python.md", "expo
         pytest.param(ROOT / "README.md", True, id="README.md, on a flight of five seconds"),
     ],
 )
-def test_code_in_the_text_runs_without_errors(path, small, monkeypatch, tmp_path, capsys, request):
+def test_code_in_the_documentation_runs_without_errors(path, small, monkeypatch, tmp_path, capsys, request):
     monkeypatch.chdir(tmp_path)
     Path("scenarios").symlink_to(ROOT / "scenarios")
     monkeypatch.setattr("ptsmc_jax.configure.configure", lambda **_: None)  # done in conftest
@@ -186,7 +186,7 @@ def test_code_in_the_text_runs_without_errors(path, small, monkeypatch, tmp_path
 
 
 @pytest.mark.long
-def test_the_pages_build_without_warnings_and_external_files(tmp_path):
+def test_the_documentation_builds_without_warnings_and_external_files(tmp_path):
     building = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html", str(DOCS), str(tmp_path)]
     done = subprocess.run(building, capture_output=True, text=True, cwd=ROOT, check=False)
     assert (done.returncode, done.stderr) == (0, "")

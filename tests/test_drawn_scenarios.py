@@ -56,7 +56,7 @@ def drawn(seed):
 
 
 def accepted(tables):
-    """Return the scenario without keys that are refused, or without their tables if another key is missing."""
+    """Return the scenario of random tables, after removing each key or table that causes a configuration error."""
     while said := refusal(lambda: scenario.study(scenario.from_tables(tables))):
         table, key = re.findall(r"\w+", said)[:2]
         del (tables[table] if key in tables[table] else tables)[key if key in tables[table] else table]
@@ -64,7 +64,7 @@ def accepted(tables):
 
 
 def refusal(call):
-    """Return the text of a configuration error, empty if there is none."""
+    """Return the text of the configuration error that this call raises, empty if there is none."""
     try:
         call()
     except ScenarioError as error:

@@ -26,10 +26,11 @@ TABLES, CHAIN = untuned(SHORT), untuned(SHORT_CHAIN)
 
 @pytest.fixture(scope="module")
 def flight():
+    """Return the simulated run of trial 7 of a short spacecraft scenario."""
     return ptsmc_jax.simulate(scenario.from_tables(TABLES), seed=3, trial=7)
 
 
-def test_simulate_gives_the_run_of_the_trial(flight):
+def test_simulate_returns_metrics_verdicts_and_history_of_a_trial(flight):
     run = runs.simulate(scenario.study(flight.scenario), 3, 7)
     assert list(flight.metrics) == list(run.metrics)
     np.testing.assert_array_equal(list(flight.metrics.values()), list(run.metrics.values()))
@@ -105,14 +106,14 @@ def test_the_gravity_gradient_uses_the_new_inertia_of_the_true_plant(flight, kno
     np.testing.assert_array_equal(torque, expected)
 
 
-def test_simulate_refuses_a_singular_nominal_start():
+def test_simulate_refuses_a_nominal_initial_attitude_at_the_singularity_of_the_law():
     turned = scenario.from_tables({**TABLES, "initial": {"rotvec_deg": [180.0, 0.0, 0.0]}})
     with pytest.raises(ScenarioError, match="q4 = 0"):
         ptsmc_jax.simulate(turned)
     assert ptsmc_jax.simulate(turned, trial=0).status in ("ok", "not_converged")
 
 
-def test_tables_show_units_and_escape_what_they_show(flight):
+def test_html_tables_of_a_run_show_units_and_escape_their_texts(flight):
     shown = flight._repr_html_()
     for name, entry in flight.run.catalogue.items():
         assert f"<td>{name}</td>" in shown
@@ -127,7 +128,7 @@ def test_tables_show_units_and_escape_what_they_show(flight):
     assert explore.units()["effort"] == catalogues.CATALOGUE["effort"][0]
 
 
-def test_figures_by_name(flight, monkeypatch):
+def test_plot_returns_and_displays_the_figures_with_the_given_names(flight, monkeypatch):
     assert set(flight.plot()) == {"attitude", "rate", "error", "sliding", "torque", "convergence", "disturbance"}
     two = flight.plot("error", "torque")
     assert list(two) == ["error", "torque"]
@@ -139,7 +140,7 @@ def test_figures_by_name(flight, monkeypatch):
         flight.plot("eror")
 
 
-def test_trials_returns_the_rows_of_the_campaign(flight):
+def test_trials_returns_the_rows_of_a_campaign_and_verdicts_judges_them(flight):
     rows = ptsmc_jax.trials(flight.scenario, 70, seed=3)
     made = campaign.Campaign(scenario.study(flight.scenario), 3)
     assert rows.equals(made.simulate(range(70)))
@@ -152,6 +153,7 @@ def test_trials_returns_the_rows_of_the_campaign(flight):
 
 
 def test_verdicts_accepts_all_kinds_of_scenarios_and_validates_rows(flight, tmp_path):
+    """A scenario is a file, a scenario object or a study. Rows need a status and the required metrics."""
     rows = ptsmc_jax.trials(flight.scenario, 3)
     (tmp_path / "s.toml").write_text(SHORT)
     (expected,) = ptsmc_jax.verdicts(flight.scenario, rows)
@@ -180,12 +182,13 @@ def test_an_animation_is_one_page_without_external_files(flight, tmp_path):
     assert "states" in chain.plot()
 
 
-def test_rotated_axes_match_scipy():
+def test_rotated_axes_of_an_animation_match_scipy():
     turn, vectors = Rotation.from_rotvec([0.4, -1.2, 0.7]), np.random.default_rng(0).normal(size=(5, 3))
     np.testing.assert_allclose(animation.rotate_to_inertial(turn.as_quat(), vectors), turn.apply(vectors), atol=1e-14)
 
 
 def peak(result, parts):
+    """Return a custom metric: `mine`, twice the peak torque."""
     return {"mine": 2.0 * result.metrics.peak_torque}
 
 
@@ -251,8 +254,11 @@ def test_an_animation_draws_body_and_reference_at_even_times(monkeypatch):
 
 
 class Reported(tuning.explore.Outcome):
+    """An outcome with a fixed report of two sections, and two named figures."""
+
     @property
     def report(self):
+        """Return a report with a table of gains, texts, and letters that HTML needs escaped."""
         table = Table(("gain", "tuned"), [("eta", "2.9"), ("observer_gain", "3 & 4")])
         blocks = [Text(["one", "two"]), Chart("none", {}, "")]
         return Report(
@@ -260,6 +266,7 @@ class Reported(tuning.explore.Outcome):
         )
 
     def _figures(self):
+        """Return two figures by name."""
         return dict.fromkeys("ab")
 
 
@@ -288,7 +295,7 @@ def test_outcome_shows_its_report_as_text_and_as_escaped_tables():
         shown.plot("c")
 
 
-def test_the_campaign_has_the_trials_of_trials(flight, tmp_path):
+def test_montecarlo_simulates_the_same_rows_as_trials(flight, tmp_path):
     found = tuning.montecarlo(flight.scenario, 20, seed=3, folder=tmp_path / "c")
     rows = ptsmc_jax.trials(flight.scenario, 20, seed=3)
     assert found.rows.select(rows.columns).equals(rows)
@@ -318,7 +325,7 @@ def test_a_campaign_is_refused_before_anything_is_written(tmp_path):
 
 
 @pytest.mark.long
-def test_tuned_gains_meet_the_requirements_again(monkeypatch):
+def test_tuned_gains_meet_the_requirements_in_other_trials(monkeypatch):
     small_search(monkeypatch)
     tuned = tuning.tune(scenario.from_tables(tomllib.loads(SHORT)))
     assert tuned.met
@@ -333,7 +340,8 @@ def test_tuned_gains_meet_the_requirements_again(monkeypatch):
     assert {"history", "tradeoff"} <= set(tuned.plot())
 
 
-def test_tuning_lists_its_functions_and_has_no_other_names():
+def test_tuning_exports_every_function_of_its_module_explore():
+    """An unknown name raises an AttributeError."""
     made = inspect.getmembers(tuning.explore, inspect.isfunction)
     functions = {name for name, one in made if one.__module__ == "tuning.explore" and not name.startswith("_")}
     assert functions <= set(dir(tuning))

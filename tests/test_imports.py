@@ -65,7 +65,7 @@ print(json.dumps([changed, started, len(before), warned, late]))
 
 
 @pytest.mark.parametrize("package", ["ptsmc_jax", "ptsmc_jax.scenario"])
-def test_every_export_resolves(package):
+def test_every_exported_name_of_a_package_is_found_in_its_module(package):
     offering = importlib.import_module(package)
     assert offering._EXPORTS
     for name, module in offering._EXPORTS.items():
@@ -77,6 +77,7 @@ def test_every_export_resolves(package):
 
 
 def test_type_checkers_see_the_same_exports():
+    """The imports under TYPE_CHECKING equal the lazy exports of the package."""
     package = "ptsmc_jax.scenario"
     tree = ast.parse(modules()[package].read_text())
     (block,) = [node for node in tree.body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"]

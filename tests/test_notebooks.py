@@ -26,7 +26,7 @@ def test_the_documentation_lists_every_notebook():
 @pytest.mark.long
 @pytest.mark.filterwarnings("ignore")  # warnings of the kernel client
 @every_notebook
-def test_the_notebook_runs_in_a_kernel(source):
+def test_a_notebook_runs_without_errors_and_warnings(source):
     book = executed(source)
     code = [cell for cell in book.cells if cell.cell_type == "code"]
     assert all(cell.execution_count for cell in code if cell.source.strip())
@@ -37,7 +37,7 @@ def test_the_notebook_runs_in_a_kernel(source):
 
 
 @every_notebook
-def test_the_stored_notebook_matches_its_source(source):
+def test_a_stored_notebook_matches_its_source_and_has_portable_outputs(source):
     kept, edited = nbformat.read(source.with_suffix(".ipynb"), 4), jupytext.read(source)
     assert [(cell.cell_type, cell.source) for cell in kept.cells] == [
         (cell.cell_type, cell.source) for cell in edited.cells
@@ -57,7 +57,7 @@ def test_the_stored_notebook_matches_its_source(source):
 
 
 @every_notebook
-def test_links_lead_to_existing_files(source):
+def test_links_in_notebooks_lead_to_existing_files(source):
     texts = [cell.source for cell in jupytext.read(source).cells if cell.cell_type == "markdown"]
     for link in re.findall(r"\]\((?!http|#)([^)#]+)", "\n".join(texts)):
         assert (source.parent / link).exists(), link

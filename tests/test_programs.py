@@ -26,6 +26,7 @@ X = np.linspace(0.0, 1.0, 5)
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
+    """Return the folder for stored programs, which the first stored program creates."""
     monkeypatch.setattr(configure, "programs", tmp_path / "programs")
     return tmp_path / "programs"
 
@@ -37,7 +38,7 @@ def ours(function, name="ours"):
 
 
 def spied(name="spied", factor=2.0):
-    """Return a program, which a new process would make of the same function, and the list of its traces."""
+    """Return a program, as a new process would make it of the same function, and the list of threads that traced it."""
     traced = []
 
     def function(x, y=1.0, kind="plain", points=2):
@@ -48,10 +49,11 @@ def spied(name="spied", factor=2.0):
 
 
 def count(folder):
+    """Return the number of files in a folder."""
     return len(list(folder.iterdir()))
 
 
-def test_a_program_is_traced_once_and_read_by_the_next_process(folder):
+def test_a_stored_program_is_traced_once_and_read_by_the_next_process(folder):
     program, traced = spied()
     first = [program(X), program(2 * X)]
     assert len(traced) == 1
@@ -123,6 +125,7 @@ def test_a_thread_with_another_precision_has_other_programs(folder):
 
 
 def test_a_prepared_program_is_read_and_compiled_once(folder):
+    """A program is prepared in the background before its first call."""
     spied()[0](X)
     again, traced = spied()
     again.prepare(X)
@@ -195,6 +198,8 @@ def test_an_error_of_the_function_is_raised_by_the_call(folder):
 
 
 def test_every_dependence_of_a_program_changes_its_file(folder, monkeypatch):
+    """Shapes, types, static arguments, versions, source code and settings of JAX each lead to another stored file."""
+
     def files(*args, **kwargs):
         program, _ = spied()
         program(*args, **kwargs)
@@ -215,7 +220,7 @@ def test_every_dependence_of_a_program_changes_its_file(folder, monkeypatch):
             assert files(X) == 9 + k
 
 
-def test_a_change_of_a_setting_after_the_first_call_takes_effect(folder):
+def test_a_change_of_a_jax_setting_after_the_first_call_takes_effect(folder):
     """As with `jax.jit`: the program of the first call must not serve the second."""
 
     def function(x):
@@ -231,15 +236,19 @@ def test_a_change_of_a_setting_after_the_first_call_takes_effect(folder):
 @pytrees.pytree
 @dataclass(frozen=True)
 class _Law:
+    """A law with a static field and a gain."""
+
     order: int = field(default=2, metadata={"static": True}, kw_only=True)
     gain: Any = 1.0
 
 
 class _Other(_Law):
-    pass
+    """Another class with the same fields."""
 
 
 class _Pair(NamedTuple):
+    """A result with two parts."""
+
     law: Any
     rest: Any
 
@@ -250,7 +259,7 @@ for _kind in (_Law, _Other, _Pair):
 pytrees.pytree(_Other)
 
 
-def test_two_laws_with_the_same_numbers_are_two_programs(folder):
+def test_two_classes_of_laws_with_the_same_numbers_have_different_programs(folder):
     def function(law):
         return law.gain * (3.0 if type(law) is _Other else 1.0)
 
@@ -261,7 +270,7 @@ def test_two_laws_with_the_same_numbers_are_two_programs(folder):
         assert count(folder) == 3
 
 
-def test_results_keep_their_structure(folder):
+def test_results_of_stored_programs_keep_their_structure(folder):
     def function(x):
         return _Pair(_Law(order=5, gain=x), {"b": [x, None], "a": (2.0 * x, _Other(gain=3.0 * x))})
 
@@ -286,7 +295,7 @@ def test_a_result_can_be_an_argument_of_a_program_for_several_devices(folder):
 
 
 @pytest.mark.parametrize("damage", ["cut short", "empty", "of another program", "a bit"])
-def test_a_damaged_file_is_traced_again(folder, damage):
+def test_a_stored_program_with_a_damaged_file_is_traced_again(folder, damage):
     program, _ = spied()
     program(X)
     (stored,) = folder.iterdir()
@@ -308,7 +317,7 @@ def test_a_damaged_file_is_traced_again(folder, damage):
     assert stored.read_bytes() == content
 
 
-def test_programs_in_a_folder_that_cannot_be_written_are_read(folder, monkeypatch):
+def test_stored_programs_in_a_read_only_folder_are_used(folder, monkeypatch):
     """As in an image of a container that is mounted read-only."""
 
     def refusing(call):
@@ -329,8 +338,8 @@ def test_programs_in_a_folder_that_cannot_be_written_are_read(folder, monkeypatc
     assert count(folder) == 1
 
 
-def test_a_program_that_cannot_be_identified_is_traced(folder):
-    """A function or class of the user, a tracer, keys of random numbers, an array of another device."""
+def test_a_program_that_cannot_be_identified_is_traced_and_not_stored(folder):
+    """It has a function or class of the user, a tracer, keys of random numbers, or an array of another device."""
 
     def custom(x):
         return 2.0 * x
@@ -355,7 +364,7 @@ def test_a_program_that_cannot_be_identified_is_traced(folder):
     assert program(elsewhere)["both"].devices() == {jax.local_devices()[-1]}
 
 
-def test_the_least_recently_used_files_are_deleted(folder, monkeypatch):
+def test_the_least_recently_used_stored_programs_are_deleted(folder, monkeypatch):
     monkeypatch.setattr(programs, "MOST_STORED", 3)
     made = []
     for k in range(4):
@@ -428,6 +437,7 @@ def test_every_program_is_a_function_of_its_module():
 
 
 def test_a_program_of_the_search_depends_on_the_files_of_the_library_too(folder, tmp_path, monkeypatch):
+    """An edited file of `ptsmc_jax` changes the stored programs of `tuning` too, but not the other way round."""
     for name in programs.OURS:
         (tmp_path / name).mkdir()
     monkeypatch.setattr(provenance, "FOLDER", tmp_path)
