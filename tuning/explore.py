@@ -53,7 +53,7 @@ class Outcome:
         raise NotImplementedError
 
     def _figures(self) -> dict[str, Any]:
-        """Return all figures by name."""
+        """Return the Matplotlib figures of the result, a dict by name."""
         raise NotImplementedError
 
     def plot(self, *names: str) -> Figures:

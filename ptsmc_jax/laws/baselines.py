@@ -37,6 +37,7 @@ class PD(ComparisonLaw):
     switches: ClassVar[bool] = False
 
     def acceleration(self, now: Sample, error: Vector, error_rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
+        """Return the commanded eps'' and the sliding variable s, (m,) each."""
         return -self.k_p * error - self.k_d * error_rate, error + self.k_d / self.k_p * error_rate
 
     def half_turn_rate(self, t_f: float) -> tuple[str, Scalar | float]:
@@ -155,6 +156,7 @@ class FixedTime(ComparisonLaw):
     sign_width: Leaf = boundary_layer(1e-3)
 
     def acceleration(self, now: Sample, error: Vector, error_rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
+        """Return the commanded eps'' and the sliding variable s, (m,) each."""
         exponent = self.gamma - 1.0 / self.p
         kappa = self.a1 * guards.signed_power(jnp.abs(error), exponent) + self.b1
         kappa_derivative = self.a1 * exponent * guards.signed_power(error, exponent - 1.0)
@@ -261,6 +263,7 @@ class PredefinedTime(ComparisonLaw):
     sign_width: Leaf = boundary_layer(Scaled(1e-2, time=-1), "1/s")
 
     def acceleration(self, now: Sample, error: Vector, error_rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
+        """Return the commanded eps'' and the sliding variable s, (m,) each."""
         surface_time, reaching_time = self.share * self.t_f, (1.0 - self.share) * self.t_f
         surface = phi(error, self.q1, surface_time)
         squares = error_rate * jnp.abs(error_rate) + 2.0 * surface * jnp.abs(surface)

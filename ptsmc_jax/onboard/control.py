@@ -32,7 +32,7 @@ def _flatten(arrays: Sequence[np.ndarray]) -> list[Node]:
 
 
 def _new_variables(translator: "Translator", variables: Sequence[Any]) -> list[np.ndarray]:
-    """Return new C variables for the components of these variables of the jaxpr."""
+    """Return an array for each variable of the jaxpr, in its shape, with a new C variable for each component."""
     return [object_array(aval.shape, (translator.pool.new_variable(kind_of(aval.dtype)) for _ in range(aval.size)))
             for aval in (variable.aval for variable in variables)]  # fmt: skip
 

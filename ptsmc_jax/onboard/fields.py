@@ -79,7 +79,7 @@ def struct_fields(trees: Mapping[str, object], meanings: Mapping[str, str]) -> d
         meanings: the meaning of trees that are a single leaf, by name.
 
     Returns:
-        A field for each leaf, by the name of the tree.
+        For each tree, by its name, the list of its fields, one for each leaf.
 
     Raises:
         NoRuleError: the dtype of a leaf has no C type.
@@ -150,7 +150,7 @@ class Parameters:
         return [member.nodes(pool, f"{self.struct_pointer(member)}->") for member in self.fields]
 
     def mark_used(self, printer: Printer) -> None:
-        """Mark the fields that a function reads."""
+        """Add to `used` the names of the parameters that the function of this printer reads."""
         read_names = {node.value.partition("[")[0] for node in printer.use_counts if node.op == "place"}
         self.used |= {
             member.name for member in self.fields if f"{self.struct_pointer(member)}->{member.name}" in read_names

@@ -114,7 +114,10 @@ def _short_meaning(comment: str) -> str:
 
 
 def _default_start(field: Field) -> list[float] | float:
-    """Return the start value of an input: the identity for a quaternion, otherwise zero."""
+    """Return the start value of an input: the identity for a quaternion, otherwise zero.
+
+    A field of shape (4,) is a quaternion, unless its name has "wheel".
+    """
     return [0.0, 0.0, 0.0, 1.0] if field.shape == (4,) and "wheel" not in field.name else 0.0
 
 

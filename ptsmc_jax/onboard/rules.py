@@ -76,6 +76,10 @@ def _bool_operation(op: str) -> Callable:
 
 
 def _select(pool: Pool, params: object, kind: str, selector: Node, *cases: Node) -> Node:
+    """Rule of select_n: return the case that the selector numbers.
+
+    A bool selects between no and yes, in this order. A whole number beyond the ends selects the nearest case.
+    """
     if selector.kind == BOOL:
         no, yes = cases
         return pool.make("select", selector, yes, no, kind=kind)

@@ -258,7 +258,11 @@ def _tolerance_group(column: str) -> str:
 
 
 def format_counts(by_operation: Mapping[str, int]) -> str:
-    """Return the largest number of operations of a function, by kind, such as "3 sums, 2 products"."""
+    """Return the largest number of operations of a function, by kind, such as "3 sums, 2 products".
+
+    Args:
+        by_operation: number of nodes by their operation, such as "add". Several operations form a kind.
+    """
     kinds = {"sums": "add sub neg", "products": "mul", "quotients": "div", "roots": "sqrt cbrt",
              "comparisons and choices": "lt le gt ge eq ne and or not select max min abs sign convert entry isfinite "
              "floor rint"}  # fmt: skip

@@ -151,6 +151,10 @@ def _check_reference(parts: Parts, call: _Checker) -> None:
 
 
 def _check_sensors(parts: Parts, call: _Checker) -> None:
+    """Check `begin` and `see` of custom sensors: shapes, types and finite values.
+
+    `see` is called for a control period, and for dt = 0 as at the first sample.
+    """
     custom, zero = parts.sensors.custom, jnp.zeros(())
     x = parts.controller.kinematics.align(parts.plant.visible(parts.initial), parts.reference(zero))
     memory = call("begin", custom.begin, x)

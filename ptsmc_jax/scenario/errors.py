@@ -46,8 +46,9 @@ def value_error(key: str, value: object, reason: str, allowed: str = "") -> Scen
     Args:
         key: the key, such as "controller.eta".
         value: its value.
-        reason: the text after the value, with the punctuation before it.
-        allowed: the allowed values, in words; empty if the reason does not end with them.
+        reason: the text after the value, with the punctuation before it. It ends with the allowed values, if there are
+            any.
+        allowed: the same allowed values in words, an attribute of the error that is not added to its text.
     """
     return ScenarioError(f"{key} is {brief(value)}{reason}", key=key, value=value, allowed=allowed)
 

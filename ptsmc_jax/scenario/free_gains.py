@@ -136,7 +136,7 @@ def _check_bounds(context: BoundsContext, name: str) -> None:
         raise ScenarioError(f"{key} is not a known gain; {parsing.nearest_name_hint(name, known_gains)}")
     if name not in context.free:
         raise ScenarioError(f"{key} bounds a gain that is not free; tune.free is {errors.brief(context.free)}")
-    smallest, largest, is_closed = gain_bounds.bounds_of(context.scenario, name).allowed(context)
+    smallest, largest, is_closed = gain_bounds.rules_of(context.scenario, name).allowed(context)
     if not (smallest <= lower if is_closed else smallest < lower) or not upper < largest:
         allowed = f"two numbers {'of at least' if is_closed else 'above'} {smallest}"
         raise wrong(key, [lower, upper], allowed + (f" and below {largest}" if math.isfinite(largest) else ""))
@@ -150,7 +150,7 @@ def _default_bounds(context: BoundsContext, name: str) -> tuple[float, float]:
     The lower bound moves to the middle between the gain and the smallest allowed value. The upper bound moves to twice
     the gain's distance from the smallest allowed value, at most to the middle between the gain and the largest one.
     """
-    gain_rules = gain_bounds.bounds_of(context.scenario, name)
+    gain_rules = gain_bounds.rules_of(context.scenario, name)
     (low, high), values = gain_rules.usual(context), _present_values(context.scenario, name)
     if values:
         smallest, largest, is_closed = gain_rules.allowed(context)
@@ -183,7 +183,7 @@ def reason_of_bound(scenario: Scenario, name: str, side: str, bound: float) -> s
         side: "lower" or "upper".
         bound: the bound.
     """
-    gain_rules = gain_bounds.bounds_of(scenario, name)
+    gain_rules = gain_bounds.rules_of(scenario, name)
     reason = gain_rules.reason_below if side == "lower" else gain_rules.reason_above
     if not scenario.sampled or reason is None:
         return None
@@ -209,7 +209,7 @@ def value_beyond_bound(scenario: Scenario, name: str, side: str) -> float | None
     low, high = scenario.search.bounds[name]
     if reason_of_bound(scenario, name, side, low if side == "lower" else high) is not None:
         return None
-    smallest, largest, _ = gain_bounds.bounds_of(scenario, name).allowed(_search_context(scenario))
+    smallest, largest, _ = gain_bounds.rules_of(scenario, name).allowed(_search_context(scenario))
     if is_log_scaled(low, high):
         step = (high / low) ** 0.1
         value = low / step if side == "lower" else high * step
@@ -243,7 +243,7 @@ def widen_bounds(
         is_default = ("tune", "bounds", name) in defaulted
         if not is_default or reason_of_bound(scenario, name, side, low if side == "lower" else high) is not None:
             continue
-        smallest, largest, _ = gain_bounds.bounds_of(scenario, name).allowed(_search_context(scenario))
+        smallest, largest, _ = gain_bounds.rules_of(scenario, name).allowed(_search_context(scenario))
         if name == "delta":  # the upper bound stays: the clock has samples for it only
             largest = high
         if side == "lower" and is_log_scaled(low, high) and math.isfinite(smallest):
@@ -259,7 +259,7 @@ def widen_bounds(
 
 def usual_bounds(scenario: Scenario, name: str) -> tuple[float, float]:
     """Return the usual bounds of a free gain, before they are widened to include the scenario's gain."""
-    low, high = gain_bounds.bounds_of(scenario, name).usual(_search_context(scenario))
+    low, high = gain_bounds.rules_of(scenario, name).usual(_search_context(scenario))
     return rounded(low), rounded(high)
 
 

@@ -1,4 +1,4 @@
-"""Usual and allowed bounds of each gain of a search. Start with `bounds_of`.
+"""Usual and allowed bounds of each gain of a search. Start with `rules_of`.
 
 The bounds are in `BOUNDS`, by the names that declarations of gains use, or in the declaration itself.
 """
@@ -87,8 +87,13 @@ class GainBounds(NamedTuple):
     reason_above: str | None = None  # why values above the usual upper bound are useless
 
 
-def bounds_of(scenario: Scenario, name: str) -> GainBounds:
-    """Return the bounds of a scenario's gain; `name`: such as "observer_gain"."""
+def rules_of(scenario: Scenario, name: str) -> GainBounds:
+    """Return the rules for the usual and the allowed bounds of a gain. They do not contain its bounds in [tune].
+
+    Args:
+        scenario: the scenario.
+        name: name of the gain, such as "observer_gain".
+    """
     table = next(table for table in scenario.tuned_tables.values() if name in table.gains)
     key = name.removeprefix(table.prefix)
     declared = table.declared.get(key)

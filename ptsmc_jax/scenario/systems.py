@@ -52,9 +52,15 @@ def location(qualified_name: str) -> str:
 
 
 def load(system_or_name: object) -> System:
-    """Return a system, or load it by its name; raise ValueError if there is none.
+    """Return a system, or load it by its name.
 
     The result is the same object as long as the file does not change, see `load_object`.
+
+    Args:
+        system_or_name: a system, or a name such as "pendulum.py:SYSTEM".
+
+    Raises:
+        ValueError: there is no object of this name, or it is no system.
     """
     if not isinstance(system_or_name, str):
         if not isinstance(system_or_name, System):

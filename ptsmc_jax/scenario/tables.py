@@ -192,7 +192,7 @@ class Tune(Table, frozen=True):
 
     @property
     def gains(self) -> tuple[str, ...]:
-        """The free gains; in a validated scenario `free` is filled in."""
+        """The names of the free gains; in a validated scenario `free` is filled in."""
         return self.free or ()
 
 

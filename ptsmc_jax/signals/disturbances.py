@@ -197,6 +197,7 @@ class Sum(Disturbance):
     terms: tuple[Any, ...]
 
     def __call__(self, t: Scalar, x: State) -> Float[Array, " m"]:
+        """Return the sum (m,) of all terms at t [s] in the state x, in the plant's input unit."""
         total = self.terms[0](t, x)
         for term in self.terms[1:]:
             total = total + term(t, x)

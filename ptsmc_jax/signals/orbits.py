@@ -203,6 +203,7 @@ class OrbitDirection:
     name: str = field(metadata={"static": True})  # "nadir", "velocity" or "orbit_normal"
 
     def __call__(self, t: Any, place: Place, orbit: Orbit, xp: ModuleType) -> Any:
+        """Return vectors (.., 3) of any length in inertial axes at these places (..,); see `Fixed.__call__`."""
         if self.name == "nadir":
             return -place.radial
         if self.name == "orbit_normal":
@@ -219,6 +220,10 @@ class GroundPoint:
     point: Any  # (3,) Earth-fixed coordinates of the point [m]
 
     def __call__(self, t: Any, place: Place, orbit: Orbit, xp: ModuleType) -> Any:
+        """Return vectors (.., 3) from the spacecraft to the point in inertial axes, divided by the orbit radius.
+
+        The arguments are those of `Fixed.__call__`.
+        """
         angle = orbit.earth_angle + EARTH_RATE * t
         sine, cosine = xp.sin(angle), xp.cos(angle)
         x, y, z = (self.point[k] for k in range(3))
@@ -235,6 +240,7 @@ class Sun:
     anomaly: Any  # mean anomaly of the Sun at t = 0 [rad]
 
     def __call__(self, t: Any, place: Place | None, orbit: Orbit | None, xp: ModuleType) -> Any:
+        """Return unit vectors (.., 3) to the Sun in inertial axes at times t (..,) [s]; see `Fixed.__call__`."""
         g = self.anomaly + np.deg2rad(0.9856003) / DAY * t
         mean = self.longitude + np.deg2rad(0.9856474) / DAY * t
         ecliptic = mean + np.deg2rad(1.915) * xp.sin(g) + np.deg2rad(0.020) * xp.sin(2.0 * g)
@@ -246,7 +252,11 @@ Direction = Fixed | OrbitDirection | GroundPoint | Sun
 
 
 def sun_direction(days: float) -> Sun:
-    """Return the direction to the Sun for days since J2000 at t = 0."""
+    """Return the direction to the Sun, a function of time.
+
+    Args:
+        days: time from J2000 to t = 0 [days].
+    """
     turn = 2.0 * np.pi
     return Sun(np.deg2rad(280.460 + 0.9856474 * days) % turn, np.deg2rad(357.528 + 0.9856003 * days) % turn)
 
@@ -277,6 +287,7 @@ class NadirReference(MissionReference):
     orbit: Orbit
 
     def frame(self, t: Scalar) -> Float[Array, "4"]:
+        """Return the quaternion (4,) from orbit axes (radial, along-track, normal) to inertial axes at t [s]."""
         return self.orbit.quaternion(t)
 
 
@@ -313,6 +324,7 @@ class TwoVectorReference(MissionReference):
         return primary, secondary
 
     def frame(self, t: Scalar) -> Float[Array, "4"]:
+        """Return the quaternion (4,) of `matrix` at t [s], with the sign of the nearest anchor."""
         last = self.anchors.shape[0] - 1
         index = jnp.clip(jnp.floor(t * self.anchor_rate), 0, last).astype(jnp.int32)
         return quaternion_near(self.matrix(t), lax.dynamic_index_in_dim(self.anchors, index, keepdims=False))

@@ -170,7 +170,7 @@ class Slew(Reference):
 @pytree
 @dataclass(frozen=True)
 class Origin:
-    """The reference of an integrator chain: the origin."""
+    """The reference of an integrator chain: the origin. Its target is None, not zeros."""
 
     def __call__(self, t: Scalar) -> None:
         """Return None, because the origin needs no numbers."""

@@ -364,7 +364,7 @@ def test_default_bounds_of_every_gain_are_valid_and_contain_the_scenarios_gain(p
         for name in free:
             (low, high), (least, most, closed) = (
                 loaded.search.bounds[name],
-                gain_bounds.bounds_of(loaded, name).allowed(choice),
+                gain_bounds.rules_of(loaded, name).allowed(choice),
             )
             assert least <= low if closed else least < low, name
             assert low < high < most, name

@@ -227,7 +227,7 @@ def list_counts(counts: Mapping[str, int]) -> str:
 
 
 def failed_counts(counts: Mapping[str, int]) -> dict[str, int]:
-    """Return the counts of the trials that failed or did not converge at t_f."""
+    """Return the number of trials by status, a dict without the status "ok" and without zeros."""
     return {status: count for status, count in counts.items() if count and status != "ok"}
 
 

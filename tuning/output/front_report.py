@@ -84,7 +84,11 @@ def relative_spread(point: Point) -> str:
 
 
 def remark_lines(front: Front) -> Iterator[str]:
-    """Return the lower bound, the missing points, and a warning if no point meets every requirement."""
+    """Yield remarks on the front, a sentence each, as far as they apply.
+
+    They concern the lower bound, missing and omitted points, requirements that no point meets, and published gains
+    that cannot be simulated.
+    """
     kind = KINDS[front.against]
     if front.lower_bound:
         lower_bound = format_error(front.lower_bound, front.plant)
@@ -169,6 +173,7 @@ def _labelled_points(front: Front) -> list[tuple[str, Point]]:
 
 
 def _format_value(value: float) -> str:
+    """Return a number as text with four digits, or "none" if it is not finite."""
     return f"{value:.4g}" if math.isfinite(value) else "none"
 
 

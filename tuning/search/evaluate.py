@@ -180,6 +180,12 @@ def _gains_with_derivatives(normalised: jax.Array, scale: Scale) -> dict[str, ja
 
 @programs.jit(compiler_options=programs.FAST_COMPILE)
 def _judge_points(rules: Rules, gains: jax.Array, metrics: jax.Array, status: jax.Array) -> dict[str, jax.Array]:
+    """Judge points by the rules; all other arguments have a leading axis of points.
+
+    Returns:
+        By name: "f", which is minimised, (points,); constraints "c", (points, rows, trials); "value", the logarithm of
+        the objective, (points,).
+    """
     return dict(zip(("f", "c", "value"), jax.vmap(partial(judge, rules))(gains, metrics, status), strict=True))
 
 
@@ -187,7 +193,11 @@ def _judge_points(rules: Rules, gains: jax.Array, metrics: jax.Array, status: ja
 def _judge_gradients(
     rules: Rules, gains: jax.Array, directions: jax.Array, metrics: jax.Array, status: jax.Array, derivatives: jax.Array
 ) -> dict[str, jax.Array]:
-    """Return F, which is minimised, constraints and objective; gradients of F and constraints by the chain rule."""
+    """Judge points with gradients by the chain rule; all arguments but `rules` have a leading axis of points.
+
+    Returns:
+        The arrays of `_judge_points`, and the gradients "f_gradient" and "c_gradient" with a last axis of gains.
+    """
 
     def judge_point(
         gains: jax.Array, directions: jax.Array, metrics: jax.Array, status: jax.Array, derivatives: jax.Array

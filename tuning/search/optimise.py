@@ -140,6 +140,10 @@ def search(
 def _search_with_gradients(
     rounds: Rounds, local_searches: LocalSearches, scenario_gains: np.ndarray, settings: Settings, announce: Announce
 ) -> None:
+    """Run local searches from several starting points, and search again with harder trials.
+
+    If no gains meet every requirement, search globally. The results are in `local_searches`.
+    """
     starts, seed = settings.starts, settings.seed
     local_searches.begin(rounds.problem, scenario_gains, settings.designs)
     rounds.begin(local_searches.gains)
@@ -155,6 +159,10 @@ def _search_with_gradients(
 def _search_without_gradients(
     rounds: Rounds, local_searches: LocalSearches, scenario_gains: np.ndarray, announce: Announce
 ) -> None:
+    """Search by differential evolution from the best of Sobol points, and again near the best point with harder trials.
+
+    The results are in `local_searches`.
+    """
     local_searches.measure_sobol_points(rounds.problem, scenario_gains)
     rounds.begin(local_searches.gains)
     local_searches.evolve(rounds.problem, local_searches.normalised)

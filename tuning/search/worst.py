@@ -252,13 +252,16 @@ def _coordinates_at(batch: Batch, y: np.ndarray) -> tuple[dict[str, np.ndarray],
 def _to_coordinates(
     dispersion: Dispersion, coordinates: Coordinates, y: jax.Array, names: tuple[str, ...]
 ) -> tuple[dict, dict]:
-    """Return the coordinates of these names for variables y, (cases, variables), and their derivatives.
+    """Map the unbounded variables y of the ascent to random numbers within the searched region.
 
     Args:
         dispersion: the dispersions.
-        coordinates: coordinates of all names, which give the numbers of variables.
+        coordinates: coordinates (cases, numbers) of all names; only their shapes matter.
         y: (cases, variables) variables.
         names: names of the moved dispersions.
+
+    Returns:
+        The coordinates (cases, numbers) and their derivatives (cases, variables, numbers), by name.
     """
 
     def to_coordinates(y: jax.Array) -> Coordinates:

@@ -372,7 +372,11 @@ def explain_worst_trials(folder: Folder, metrics: Sequence[str], count: int) -> 
 
 
 def _rank_input(name: str, values: np.ndarray, value: float) -> dict[str, float | None]:
-    """Return the percentile rank of an input among all trials, or the fraction of equal trials for a category."""
+    """Return the rank of an input's value among all trials, a dict.
+
+    It has the "percentile" and the "median" of a number, and the "fraction" of equal trials for a category. The others
+    are None.
+    """
     if name in CATEGORIES:
         return {"percentile": None, "median": None, "fraction": float(np.mean(values == value))}
     return {"percentile": statistics.percentile(values, value), "median": float(np.median(values)), "fraction": None}

@@ -52,7 +52,7 @@ def reference_scenarios(scenario: Scenario) -> tuple[dict[str, Scenario], str | 
 
 
 def judge(scenario: Scenario, held_out_seed: int, problem: Problem | None = None, reach: Reach | None = None) -> Trials:
-    """Simulate a scenario on its held-out trials, on the flight clock.
+    """Simulate a scenario on its held-out trials. A sampled loop gets the flight clock.
 
     If the compiled program of the search can simulate the scenario, it is used again. The results then have only the
     pointing metrics that the problem and the requirements need.

@@ -194,7 +194,10 @@ def simulate(scenario: Scenario, x: Axis, y: Axis, seed: int, trials: int, repor
 
 
 def _with_explicit_gains(scenario: Scenario) -> Scenario:
-    """Return the scenario with explicit values of its default gains, so that other keys do not change them."""
+    """Return the scenario with explicit values of its default gains, so that other keys do not change them.
+
+    t_f and the corner of the command filter are left out: their defaults are constants.
+    """
     stated = {
         f"{where}__{name.removeprefix(table.prefix)}": getattr(table, name.removeprefix(table.prefix))
         for where, table in scenario.tuned_tables.items()

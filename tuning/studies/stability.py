@@ -78,6 +78,7 @@ def worst_margins(ready: Study) -> dict[str, dict[str, Any]] | None:
 
 
 def _limit_cycle_entry(scenario: Scenario, limit_cycle: LimitCycle) -> dict[str, Any]:
+    """Return {"limit_cycle": ..} for `summary.json`: fields of the limit cycle by name, and the unit of its size."""
     unit = CATALOGUES[scenario.plant.kind]["peak_torque"].unit
     return {"limit_cycle": {**limit_cycle._asdict(), "unit": unit}}
 

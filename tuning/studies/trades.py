@@ -88,6 +88,7 @@ class Trade(ABC):
 
         Returns:
             The targets, and the gains that these searches found, (gains,) each, as fractions of the bounds' intervals.
+            Order and number of the gains may differ from those of the targets.
         """
 
     def tuned_scenario(self, value: float, found: dict[str, float]) -> Scenario:

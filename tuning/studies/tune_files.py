@@ -225,7 +225,10 @@ def history_columns(scenario: Scenario, limited: Iterable[str]) -> list[str]:
 
 
 def _points_by_start(history: Sequence[Step]) -> list[list[Step]]:
-    """Return the evaluated points of each starting point."""
+    """Return a list of evaluated points for each starting point.
+
+    The history must have the points of a starting point together.
+    """
     return [list(path) for _, path in itertools.groupby(history, lambda step: step.start)]
 
 
