@@ -28,6 +28,7 @@ def _add_block(translator: "Translator", region: Region, translate_block: Callab
 
 
 def _flatten(arrays: Sequence[np.ndarray]) -> list[Node]:
+    """Return the nodes of several arrays in one list, row by row."""
     return [node for array in arrays for node in array.flat]
 
 

@@ -42,6 +42,7 @@ def _with_inertia_inverse(model: Any) -> Any:
 
 
 def _derive_inertia_inverses(values: Values) -> Values:
+    """Derive the inverse inertia in the models of the law and the observer."""
     law, observer = values["law"], values["observer"]
     law = replace(law, kinematics=replace(law.kinematics, model=_with_inertia_inverse(law.model)))
     return values | {"law": law, "observer": replace(observer, model=_with_inertia_inverse(observer.model))}
@@ -69,6 +70,7 @@ def _derive_filter_gains(samples_per_reading: int, values: Values) -> Values:
 
 
 def _derive_wheel_allocation(values: Values) -> Values:
+    """Derive the wheels' allocation from their axes."""
     return values | {"actuators": with_wheel_allocation(values["actuators"])}
 
 

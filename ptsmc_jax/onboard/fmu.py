@@ -157,6 +157,7 @@ def _c_strings(letters: Iterable[str]) -> str:
 
 
 def _c_number(value: float) -> str:
+    """Return a real number as C writes it."""
     return repr(value) if math.isfinite(value) else "INFINITY" if value > 0.0 else "-INFINITY"
 
 

@@ -158,6 +158,7 @@ def _add_stage_function(code: Code, board: Board, stage: Stage, structs: dict[st
 
 
 def _stage_comment(stage: Stage) -> list[str]:
+    """Return the lines of a stage's C comment: its description, and the docstrings of its parts' classes."""
     paragraphs = [stage.description]
     for part in stage.parts:
         for name, text in origins.class_docstrings(part, COMMON_BASES):

@@ -42,11 +42,13 @@ def stack_frames(eqn: JaxprEqn) -> list[Frame]:
 
 @functools.cache
 def _is_foreign(file: str) -> bool:
+    """Return whether a file belongs to JAX or only wraps calls of other functions."""
     return Path(file).is_relative_to(JAX) or any(part in file for part in WRAPPERS)
 
 
 @functools.cache
 def _instruction_spans(code: CodeType) -> list[Span]:
+    """Return the position in the source of each instruction of a function, zeros if it is unknown."""
     return [(a or 0, c or 0, b or 0, d or 0) for a, b, c, d in code.co_positions()]
 
 
@@ -134,6 +136,7 @@ def _expression_uses(file: str) -> dict[Span, tuple[tuple[str, ...] | None, int 
 
 
 def _span(node: Any) -> Span:
+    """Return the position of a syntax node: first line and column, last line and column."""
     return node.lineno, node.col_offset, node.end_lineno, node.end_col_offset
 
 

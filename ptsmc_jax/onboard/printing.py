@@ -132,6 +132,7 @@ class Printer:
                     self._count_region_uses(node.value)
 
     def _count_region_uses(self, region: Region) -> None:
+        """Count the uses of nodes in a branch or a loop."""
         self._count_use(*([] if region.test is None else [region.test]), *region.initial)
         for nodes in (*(entries for _, entries in region.tables), *region.outputs):
             self._count_use(*nodes)
@@ -144,6 +145,7 @@ class Printer:
     # statements
 
     def _print_block(self, block: Block, indent: str) -> list[str]:
+        """Return the C lines of a block: a constant for each node with a variable, and its regions."""
         lines: list[str] = []
         for node in block.nodes:
             if node not in self.use_counts:
@@ -159,12 +161,14 @@ class Printer:
         return lines
 
     def _section_heading(self, node: Node, indent: str) -> list[str]:
+        """Return the lines of a heading if a node begins another section, otherwise an empty list."""
         if node.section in ("", self.section):
             return []
         self.section = node.section
         return ["", *format_comment(node.section, indent)]
 
     def _print_branch(self, region: Region, indent: str) -> list[str]:
+        """Return the C lines of if and else. They assign the needed results of the region to variables."""
         results = [(k, node) for k, node in enumerate(region.results) if node in self.use_counts]
         lines = [f"{indent}{c_type(node.kind)} {self._variable_name(node)};" for _, node in results]
         assert region.test is not None
@@ -181,6 +185,10 @@ class Printer:
         return [*lines, f"{indent}}}"]
 
     def _print_loop(self, region: Region, indent: str) -> list[str]:
+        """Return the C lines of a loop: initial values, tables that the body reads or fills, and the body.
+
+        The operations of a counted loop count once for each pass.
+        """
         inner, lines = indent + "    ", []
         for node, start, result in zip(region.carried, region.initial, region.results, strict=True):
             node.title, node.indices = result.title, result.indices
@@ -224,6 +232,7 @@ class Printer:
     # names
 
     def _variable_name(self, node: Node) -> str:
+        """Return the C name of the variable of a node, always the same one."""
         if node not in self.names:
             if node.title is None:
                 prefix = {"index": "k", "table": "table"}.get(node.op, "a")
@@ -235,12 +244,14 @@ class Printer:
         return self.names[node]
 
     def _base_name(self, title: Title) -> str:
+        """Return the first part of C names for a value's name in the source, without reserved words."""
         if title not in self.bases:
             plain = re.sub(r"\W", "_", title.name).strip("_") or "x"
             self.bases[title] = self._unused_name(f"{plain}_" if plain in RESERVED or plain[0].isdigit() else plain)
         return self.bases[title]
 
     def _unused_name(self, name: str, allowed: str = "") -> str:
+        """Return a C name that is not taken, with a suffix if necessary; allowed: a taken name that may be used."""
         candidate, k = name, ord("b")
         while candidate in self.taken_names and candidate != allowed:
             candidate, k = f"{name}_{chr(k)}" if k <= ord("z") else f"{name}_{k}", k + 1
@@ -254,6 +265,7 @@ class Printer:
         return self._text_and_precedence(node, inside)[0]
 
     def _text_and_precedence(self, node: Node, inside: bool = False) -> tuple[str, int]:
+        """Return the C text of a node and the precedence of its outermost operator; inside: see `text`."""
         if node.op == "constant":
             # C computes the resolution for its own type `real`, which may be float
             is_resolution = node.kind == REAL and node.value == guards.resolution()
@@ -293,6 +305,7 @@ class Printer:
         return f"M({'fabs' if node.op == 'abs' else node.op})({arguments})", ATOM
 
     def _infix(self, sign: str, precedence: int, a: Node, b: Node) -> tuple[str, int]:
+        """Return "a sign b", with parentheses where C needs them, and the precedence of the sign."""
         # parentheses avoid compiler warnings about mixed && and ||, and about comparisons of comparisons
         other_logical = {"&&": "or", "||": "and"}.get(sign)
         is_comparison = precedence in (9, 10)

@@ -50,12 +50,14 @@ def convert(pool: Pool, kind: str, x: Node) -> Node:
 
 
 def _convert_element_type(pool: Pool, params: Mapping[str, Any], kind: str, x: Node) -> Node:
+    """Rule of a conversion. Raise KeyError for a real type with fewer digits."""
     if kind == REAL and jnp.finfo(params["new_dtype"]).bits < jnp.finfo(jnp.result_type(float)).bits:
         raise KeyError("convert_element_type")  # C does not round to fewer digits
     return convert(pool, kind, x)
 
 
 def _reduce_precision(pool: Pool, params: Mapping[str, Any], kind: str, x: Node) -> Node:
+    """Rule that returns x itself. Raise KeyError if the result would have fewer digits."""
     real = jnp.finfo(jnp.result_type(float))
     if params["exponent_bits"] < real.nexp or params["mantissa_bits"] < real.nmant:
         raise KeyError("reduce_precision")
@@ -63,10 +65,13 @@ def _reduce_precision(pool: Pool, params: Mapping[str, Any], kind: str, x: Node)
 
 
 def _same_operation(op: str) -> Callable:
+    """Return the rule of a primitive that is the operation `op` in C."""
     return lambda pool, params, kind, *x: pool.make(op, *x, kind=kind)
 
 
 def _bool_operation(op: str) -> Callable:
+    """Return the rule of a logical operation. The rule raises KeyError for the bits of integers."""
+
     def rule(pool: Pool, params: object, kind: str, *x: Node) -> Node:
         if kind != BOOL:
             raise KeyError(op)  # operations on the bits of integers have no rule
@@ -105,6 +110,7 @@ def _division_rule(op: str) -> Callable:
 
 
 def _reciprocal(pool: Pool, x: Node) -> Node:
+    """Return the node of 1 / x."""
     return pool.make("div", pool.constant(1.0, REAL), x)
 
 

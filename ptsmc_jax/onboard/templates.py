@@ -139,6 +139,7 @@ def struct_members(fields: Iterable[Field]) -> str:
 
 
 def _initializer(value: np.ndarray, kind: str) -> str:
+    """Return the C initializer of a number or an array, with braces for each row."""
     if value.ndim == 0:
         return format_constant(value.item(), kind)
     return "{" + ", ".join(_initializer(row, kind) for row in value) + "}"
@@ -188,6 +189,7 @@ def _attitude_conditions(sensors: Sequence[Field]) -> list[str]:
 
 
 def _real_fields(fields: Iterable[Field]) -> list[Field]:
+    """Return the fields with real numbers, in their order."""
     return [field for field in fields if field.kind == REAL]
 
 
@@ -327,4 +329,5 @@ def _derived_tables(code: Code) -> str:
 
 
 def _member_rows(members: Iterable[Field]) -> str:
+    """Return the rows of a Markdown table: name and meaning of each member."""
     return "\n".join(f"| `{member.name}` | {' '.join(member.meaning.split())} |" for member in members)

@@ -172,6 +172,7 @@ class Translator:
         )
 
     def _index_of_extreme(self, eqn: JaxprEqn, value: np.ndarray, kind: str) -> np.ndarray:
+        """Return the components of argmax or argmin: the first index of the extreme along the reduced axis."""
         test = "gt" if eqn.primitive.name == "argmax" else "lt"
 
         def index_of_extreme(entries: np.ndarray) -> Node:
