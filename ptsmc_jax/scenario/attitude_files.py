@@ -66,6 +66,7 @@ def read(file: str, order: str | None, direction: str | None, interpolation: str
 def _read_version(
     path: Path, order: str | None, direction: str | None, interpolation: str, epoch: str | None, version: tuple
 ) -> Samples:
+    """Return the samples of a file, see `read`; version: its size and time of change, the key of the cache."""
     start_epoch = None if epoch is None else epochs.parse_key(epoch)
     if path.suffix.lower() in (".csv", ".parquet"):
         times, quaternions, rates = _read_table(path, order, direction, start_epoch)

@@ -31,6 +31,7 @@ def check_keys(scenario: Scenario) -> None:
 
 
 def _check_requirements(scenario: Scenario) -> None:
+    """Raise ScenarioError if a required metric needs a table or noise that the scenario does not have."""
     for key, value in scenario.requirements.items():
         table = scenario.metrics[key].table if key in scenario.metrics else None
         if table is not None and getattr(scenario, table, None) is None:
@@ -114,6 +115,7 @@ def check_sensors(scenario: Scenario) -> None:
 
 
 def _check_loop(scenario: Scenario) -> None:
+    """Raise ScenarioError if t_f, delta, the window, the end or the periods of the loop contradict each other."""
     controller, loop = scenario.controller, scenario.loop
     t_f, delta, window = controller.t_f, scenario.hand_over, scenario.window
     if loop.epoch is not None:
@@ -172,6 +174,7 @@ def _check_periods(scenario: Scenario) -> None:
 
 
 def _check_dispersion(scenario: Scenario) -> None:
+    """Raise ScenarioError if a dispersion needs an absent device, or if a lower end exceeds an upper end."""
     names = scenario.dispersion.__struct_fields__ if scenario.dispersion is not None else ()
     random = {name: getattr(scenario.dispersion, name) for name in names}
     random = {name: table for name, table in random.items() if table is not None}

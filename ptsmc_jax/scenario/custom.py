@@ -266,6 +266,7 @@ def _declaration(table: Any, custom_class: type, field: dataclasses.Field) -> De
 
 
 def _is_number(value: object) -> typing.TypeGuard[float]:
+    """Return whether a value is a finite number and no bool."""
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
@@ -293,6 +294,7 @@ class DrawTable(schema.PartTable, frozen=True):
 
 
 def _is_count(value: object, smallest: int) -> bool:
+    """Return whether a value is a whole number of at least `smallest`."""
     return isinstance(value, int) and not isinstance(value, bool) and value >= smallest
 
 

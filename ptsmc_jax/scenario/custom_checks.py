@@ -71,6 +71,16 @@ class _Checker:
         self._beginning, self._made = f"{name}.code is {shown}, but its", table.part_class
 
     def __call__(self, method: str, function: Callable, *args: object) -> Any:
+        """Return the value of a method of the custom class, after it has also been traced.
+
+        Args:
+            method: name of the method, for errors.
+            function: the method.
+            args: its arguments.
+
+        Raises:
+            ScenarioError: the method fails.
+        """
         try:
             function(*args)
             _check_tracing(function, args)
@@ -136,12 +146,14 @@ def _describe(value: object, exact: bool) -> str:
 
 
 def _check_disturbance(parts: Parts, signal: Disturbance, call: _Checker) -> None:
+    """Check the value of a custom disturbance at t = 0: (inputs,) finite numbers."""
     d = call("__call__", signal, jnp.zeros_like(parts.t_end), parts.initial)
     call.check("__call__", "a number for each input", d, jnp.zeros(parts.plant.inputs))
     call.check_finite("__call__", d)
 
 
 def _check_reference(parts: Parts, call: _Checker) -> None:
+    """Check that a custom reference has a unit quaternion (4,) with two finite derivatives."""
     q = call("attitude", parts.reference.attitude, jnp.zeros_like(parts.t_end))
     call.check("attitude", "a quaternion", q, jnp.zeros(4))
     if not abs(float(jnp.sum(q * q)) - 1.0) < 1e-9:
@@ -165,6 +177,7 @@ def _check_sensors(parts: Parts, call: _Checker) -> None:
 
 
 def _check_draw(parts: Parts, dispersion: Dispersion, call: _Checker) -> None:
+    """Check `at` and `values` of custom dispersions: the parts keep their structure, and names of columns are new."""
     custom: Any = dispersion.custom
     c = jnp.full(custom.count, 0.5)
     changed = call("at", custom.at, c, parts)
@@ -189,6 +202,7 @@ def _check_draw(parts: Parts, dispersion: Dispersion, call: _Checker) -> None:
 
 
 def _check_observer(parts: Parts, call: _Checker) -> None:
+    """Check `begin`, `step`, `estimate` and `error_bound` of a custom observer."""
     observer, m = parts.observer, parts.plant.inputs
     memory = call("begin", observer.begin)
     period = jnp.asarray(parts.period)
@@ -206,6 +220,7 @@ def _check_observer(parts: Parts, call: _Checker) -> None:
 
 
 def _check_law(parts: Parts, call: _Checker) -> None:
+    """Check `begin` and `acceleration` of a custom law, or its `__call__` if it has one."""
     law: Any = parts.controller
     zero, u = jnp.zeros_like(parts.t_end), jnp.zeros(parts.plant.inputs)
     target = parts.reference(zero)

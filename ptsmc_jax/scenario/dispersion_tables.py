@@ -377,6 +377,12 @@ _STATE: dict[str, tuple[str, Kinds]] = {
 
 
 def _dispersion_table(name: str, rows: Mapping[str, tuple[str, Kinds]]) -> Any:
+    """Return the class of the table [dispersion] of a plant.
+
+    Args:
+        name: name of the class.
+        rows: meaning and kinds of each quantity, by its key.
+    """
     summary = "Random quantities of each trial, each an inline table with a kind; the others stay nominal."
     keys = [(key, Annotated[Table | None, Meaning(meaning)], None) for key, (meaning, _) in rows.items()]
     namespace = {"__doc__": summary, "__module__": __name__}

@@ -269,4 +269,5 @@ def default_bounds(scenario: Scenario, name: str) -> tuple[float, float]:
 
 
 def _search_context(scenario: Scenario) -> BoundsContext:
+    """Return the inputs of the bounds of gains, with the free gains and the bounds in [tune]."""
     return BoundsContext(scenario, scenario.search.gains, scenario.search.bounds)

@@ -136,11 +136,13 @@ def _observer_time(scenario: Scenario) -> float:
 
 
 def _usual_t_f(context: BoundsContext) -> Interval:
+    """Return t_f from half to twice its value [s]. The lower end is later than hand-over and observer need."""
     shortest_t_f = 4.0 * context.shortest_delta if "delta" in context.free else context.scenario.hand_over
     return max(0.5 * context.t_f, 1.05 * shortest_t_f, 1.05 * _observer_time(context.scenario)), 2.0 * context.t_f
 
 
 def _allowed_t_f(context: BoundsContext) -> Allowed:
+    """Return the t_f [s] after the hand-over and the observer, with at most `MOST_STEPS` periods until the end."""
     loop, shortest = context.scenario.loop, context.shortest_delta
     lowest = max(shortest if "delta" in context.free else context.scenario.hand_over, _observer_time(context.scenario))
     hold_time = loop.t_end - context.t_f
@@ -186,6 +188,7 @@ def _scaled_bounds(low: float, high: float, power: Callable[[Any], float]) -> Ca
 
 
 def _usual_p(context: BoundsContext) -> Interval:
+    """Return the allowed p without 5 % of the interval at each end."""
     lowest = _allowed_p(context)[0]
     return lowest + 0.05 * (2.0 - lowest), 2.0 - 0.05 * (2.0 - lowest)
 
@@ -196,6 +199,7 @@ def _allowed_p(context: BoundsContext) -> Allowed:
 
 
 def _usual_gamma(context: BoundsContext) -> Interval:
+    """Return gamma from 0.05 to 2 above its smallest allowed value."""
     lowest = _allowed_gamma(context)[0]
     return lowest + 0.05, lowest + 2.0
 
@@ -219,6 +223,7 @@ def _usual_finite_time_gain(context: BoundsContext) -> Interval:
 
 
 def _allowed_finite_time_gain(context: BoundsContext) -> Allowed:
+    """Return gains above the bound on the disturbance's rate, or from 0 if it is 0."""
     lowest = context.law.disturbance_rate_bound
     return Allowed(lowest, math.inf, lowest > 0.0)
 

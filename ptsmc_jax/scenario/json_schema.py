@@ -23,6 +23,7 @@ def json_schema() -> Schema:
 
 
 def _plant_schema(kind: str, scenario: type[Scenario]) -> Schema:
+    """Return the schema of scenarios of this kind of plant; scenario: the class of its scenarios."""
     tables = {name: _kinds_schema(name, kinds, scenario.unit_of_d) for name, kinds in scenario.TABLES.items()}
     if kind == "spacecraft":
         sensor_list = {"type": "array", "items": _kinds_schema("sensors", sensor_tables.SENSORS, scenario.unit_of_d)}
@@ -74,6 +75,7 @@ def _table_schema(struct: type[Table], unit_of_d: str, name: str = "") -> Schema
 
 
 def _object_schema(description: str, properties: Schema, *, allow_more: bool = False) -> Schema:
+    """Return the schema of an object; allow_more: it may have other properties."""
     beginning = {"type": "object", "description": description}
     return {**beginning, "properties": properties, "additionalProperties": allow_more}
 

@@ -70,6 +70,7 @@ class Scales(NamedTuple):
 
 
 def _multiply(value: Any, factor: float) -> Any:
+    """Return a number, or each number of nested tuples, times a factor, rounded."""
     return tuple(_multiply(one, factor) for one in value) if isinstance(value, tuple) else rounded(factor * value)
 
 
@@ -269,6 +270,7 @@ def _disturbance_bounds(scenario: "Scenario") -> tuple[float, ...]:
 
 
 def _smallest_eta(scenario: "Scenario") -> float:
+    """Return the smallest eta that a design uses."""
     return scenario.least_eta + (SMALLEST_USEFUL_ETA - 2.0)
 
 

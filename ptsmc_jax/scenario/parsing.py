@@ -218,6 +218,7 @@ def _reduce(scenario: Scenario) -> tuple:
 
 
 def _restore(raw: Mapping[str, Any], run_code: bool, defaulted: dict[tuple[str, ...], object]) -> Scenario:
+    """Return a pickled scenario. Arguments: its tables, whether to run custom code, and `Scenario.defaulted`."""
     return msgspec.structs.replace(parse(raw, run_code=run_code), defaulted=defaulted)
 
 
@@ -376,6 +377,7 @@ def _parse_custom_part(name: str, raw: Mapping[str, object], struct: type[Table]
 
 
 def _parse_requirement(metric: str, value: object, context: Context) -> float | Limit:
+    """Return a limit, or a table with a limit, of a metric; raise ScenarioError if it is not allowed."""
     key, metrics = f"requirements.{metric}", context.scenario_class.metrics
     if metric not in metrics and metric not in catalogues.MARGINS:
         raise ScenarioError(
@@ -396,6 +398,7 @@ def _parse_requirement(metric: str, value: object, context: Context) -> float | 
 def _parse_fields(
     name: str, raw: Mapping[str, object], struct: type[Table], context: Context, kinds: Kinds | None = None
 ) -> Table:
+    """Return the table of a struct with the values of its keys; arguments as in `_parse_table`."""
     known_keys = {key.name: key for key in keys.list_keys(struct, context.scenario_class.unit_of_d)}
     values = {}
     for key, value in raw.items():
@@ -526,6 +529,7 @@ def as_written(error: ScenarioError, raw: Mapping[str, Any]) -> ScenarioError:
 
 
 def _find_non_finite(value: object) -> float | int | None:
+    """Return the first number in nested tables and lists that no finite float can hold, or None."""
     if isinstance(value, float) and not math.isfinite(value):
         return value
     if isinstance(value, int) and value.bit_length() > MOST_BITS:

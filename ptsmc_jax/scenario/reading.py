@@ -144,6 +144,7 @@ def replace(scenario: Scenario | str | Path, **changes: object) -> Scenario:
 
 
 def _default_kind(scenario: Scenario, table: str) -> str | None:
+    """Return the default kind of a table, or None if it has no kinds."""
     kinds = layouts.SCENARIOS if table == "plant" else scenario.TABLES.get(table)
     return next(iter(kinds)) if isinstance(kinds, Mapping) else None
 

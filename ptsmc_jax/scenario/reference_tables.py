@@ -137,6 +137,7 @@ class FileReference(ReferenceTable, frozen=True):
     ] = "file"
 
     def _samples(self, scenario: "SpacecraftScenario") -> attitude_files.Samples:
+        """Return the samples of the file; raise ScenarioError if it is absent or cannot be used."""
         if self.file is None:
             raise ScenarioError("reference.file is absent, but must be given: a CSV, Parquet or AEM file")
         try:

@@ -167,6 +167,7 @@ class VectorSensor(AttitudeSensorTable, frozen=True):
         return direction / np.linalg.norm(direction)
 
     def build(self, name: str, period: float) -> attitude_sensors.AttitudeSensor:
+        """Return the sensor with its unit direction; see the base class."""
         return dataclasses.replace(super().build(name, period), direction=vector(self.unit_direction))
 
 

@@ -185,6 +185,7 @@ def _import_folder(place: str) -> str:
 
 @contextlib.contextmanager
 def _importing_from(folder: str) -> Iterator[None]:
+    """Import first from this folder inside the context, without compiled copies."""
     previous, sys.dont_write_bytecode = sys.dont_write_bytecode, True  # a .pyc hides a change within a second
     sys.path.insert(0, folder)
     try:

@@ -236,6 +236,7 @@ def _fastest_system_rate(setup: Parts, visited: tuple) -> float:
 
 
 def _with_gain(observer: Any, gain: float) -> Any:
+    """Return the observer with the same gain on all axes."""
     return dataclasses.replace(observer, gain=vector(np.full(np.shape(observer.gain), gain)))
 
 
