@@ -135,6 +135,7 @@ class Simulation:
         return f"<p>{html.escape(self._ending())}</p>{self.metrics._repr_html_()}{html_list(self.verdicts)}"
 
     def _ending(self) -> str:
+        """Return the status in words, with reason and time [s] of a failure."""
         failure = f", {self.run.reason}, at {self.run.bad_time:.4g} s" if self.run.reason else ""
         return f"status: {self.status}{failure}"
 
@@ -293,10 +294,12 @@ def lower_bound(what: Scenario | Study | str | Path, *, seed: int = 0) -> float 
 
 
 def _to_scenario(what: Scenario | Study | str | Path) -> Scenario:
+    """Return a scenario: itself, that of a study, or that of a file."""
     return reading.to_scenario(what.scenario if isinstance(what, Study) else what)
 
 
 def _to_study(what: Scenario | Study | str | Path) -> Study:
+    """Return a study: itself, or that of a scenario or of its file."""
     return what if isinstance(what, Study) else scenario.study(_to_scenario(what))
 
 

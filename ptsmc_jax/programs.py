@@ -122,6 +122,7 @@ class Program:
             return method(*args, **kwargs)
 
     def _run(self, *args: Any, **kwargs: Any) -> Any:
+        """Call the program: jitted inside a trace or if nothing is stored, otherwise from the store."""
         if _is_traced(args, kwargs):
             return self._jitted(*args, **kwargs)
         if not _is_storing():
@@ -142,6 +143,7 @@ class Program:
         return _call_uninterrupted(self._call_stored, *args, **kwargs)
 
     def _call_stored(self, *args: Any, **kwargs: Any) -> Any:
+        """Call the stored program with arguments that are bound to no device, and report that it is compiled."""
         args, kwargs = _detach_from_device(args, kwargs)
         try:
             return self._stored(*args, **kwargs)
@@ -162,6 +164,7 @@ class Program:
             _awaited.pop(self._title, None)
 
     def _prepare(self, *args: Any, **kwargs: Any) -> None:
+        """Submit the compilation of the program of this call to a background thread."""
         args, kwargs = _detach_from_device(args, kwargs)
 
         def compile_program() -> None:
@@ -264,6 +267,7 @@ def _is_storing() -> bool:
 
 
 def _is_traced(args: tuple, kwargs: dict) -> bool:
+    """Return whether an argument is traced by JAX."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((args, kwargs)))
 
 
@@ -382,6 +386,7 @@ def _with_settings(function: Callable) -> Callable:
 
 
 def _thread_settings() -> list:
+    """Return JAX's settings of this thread, in the order of `SETTINGS`."""
     return [getattr(jax.config, f"jax_{name}") for name in SETTINGS]
 
 
@@ -404,6 +409,7 @@ def _read(path: Path) -> bytes | None:
 
 
 def _checksum(path: Path, content: bytes) -> bytes:
+    """Return the SHA-256 (32 bytes) of the file name and the content of a stored program."""
     return hashlib.sha256(path.name.encode() + content).digest()
 
 

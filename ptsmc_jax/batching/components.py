@@ -170,6 +170,7 @@ class ComponentRules:
         return self._broadcasts[key][1]
 
     def _elementwise(self, eqn: Any, values: Sequence[BatchedArray]) -> list[np.ndarray]:
+        """Apply a primitive to the same component of each operand. Operands get the shape of the result first."""
         name, shape = eqn.primitive.name, eqn.outvars[0].aval.shape
         operation = partial(eqn.primitive.bind, **eqn.primitive.get_bind_params(eqn.params))
         simplify = _ZERO_RULES.get(name) if _has_tangent(values) else None
@@ -183,6 +184,7 @@ class ComponentRules:
         return [object_array(shape, map(self.replacements.get(name, apply_to_component), *operands))]
 
     def _bitcast(self, eqn: Any, values: Sequence[BatchedArray]) -> list[np.ndarray] | None:
+        """Return the components with another type of the same size, or None if the sizes differ."""
         same_size = eqn.invars[0].aval.dtype.itemsize == eqn.outvars[0].aval.dtype.itemsize
         return self._elementwise(eqn, values) if same_size else None
 
@@ -193,13 +195,16 @@ class ComponentRules:
         return reduce(lambda a, b: getattr(lax, name)(*self.broadcast([a, b])), items)
 
     def _reduction(self, eqn: Any, values: Sequence[BatchedArray]) -> list[np.ndarray]:
+        """Return the components of a sum, product or extreme along axes."""
         operation = _REDUCTIONS[eqn.primitive.name]
         return [reduce_entries(eqn, values[0].components, lambda row: self._fold(operation, *row))]
 
     def _cumulative(self, eqn: Any, values: Sequence[BatchedArray]) -> list[np.ndarray]:
+        """Return the components of a cumulative sum, product or extreme along an axis."""
         return [accumulate_entries(eqn, values[0].components, partial(self._fold, _CUMULATIVE[eqn.primitive.name]))]
 
     def _contraction(self, eqn: Any, values: Sequence[BatchedArray]) -> list[np.ndarray] | None:
+        """Return the components of a `dot_general`, or None if the result is bool."""
         dtype, skip_zeros = eqn.outvars[0].aval.dtype, _has_tangent(values)
         if jnp.issubdtype(dtype, bool):
             return None

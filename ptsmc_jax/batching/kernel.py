@@ -133,6 +133,7 @@ def _table_dtype(dtype: Any) -> str:
 
 
 def _check_size(shape: tuple[int, ...]) -> None:
+    """Raise NotImplementedError if an array of this shape has too many entries for a kernel."""
     if not components.is_small(shape, MAX_COMPONENTS):
         raise NotImplementedError(f"a kernel splits arrays of at most {MAX_COMPONENTS} entries")
 
@@ -273,10 +274,12 @@ def _select(k: Any, *values: Any) -> Any:
 
 
 def _maximum(a: Any, b: Any) -> Any:
+    """Return the larger of two numbers, NaN if one of them is NaN."""
     return jnp.where((a >= b) | (a != a), a, b)
 
 
 def _minimum(a: Any, b: Any) -> Any:
+    """Return the smaller of two numbers, NaN if one of them is NaN."""
     return jnp.where((a <= b) | (a != a), a, b)
 
 
@@ -388,6 +391,7 @@ class _Interpreter:
 
 
 def _to_constant(value: Any) -> BatchedArray:
+    """Return an array of constants, split into components."""
     return BatchedArray.of_components(components.entries(np.asarray(value)))
 
 
@@ -397,6 +401,7 @@ def _is_constant(value: BatchedArray) -> bool:
 
 
 def _load_all(values: Sequence) -> list[BatchedArray]:
+    """Return the values in their order; arrays in memory are loaded."""
     return [value.load() if isinstance(value, _StoredArray) else value for value in values]
 
 

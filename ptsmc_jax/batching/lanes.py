@@ -134,6 +134,7 @@ def _batched_arguments(args: tuple, in_axes: Any) -> tuple[int, tuple, list[Batc
 
 
 def _is_mapped(axis: int | None) -> bool:
+    """Return whether an entry of in_axes maps axis 0. Raise ValueError for entries other than 0 and None."""
     if axis not in (None, 0):
         raise ValueError(f"in_axes may hold 0 and None only, found {axis}")
     return axis == 0
@@ -242,6 +243,7 @@ class _Interpreter:
         return [self._align_one(*item) for item in zip(values, axes, strict=True)]
 
     def _align_one(self, value: BatchedArray, axes: int) -> BatchedArray:
+        """Return a value as `align` does, broadcast to the batch shape of `axes`, a sum of TRIAL and DIRECTION."""
         if not axes and value.array is not None:
             return BatchedArray(value.shape, array=value.array, axes=0)
         batch = self.batch_shapes[axes]
@@ -429,6 +431,7 @@ _CONTROL_FLOW = {
 
 
 def _axes(values: Sequence[BatchedArray]) -> list[int]:
+    """Return the batch axes of each value, sums of TRIAL and DIRECTION."""
     return [value.axes for value in values]
 
 

@@ -78,6 +78,7 @@ class Campaign:
         return pl.DataFrame({"trial": wanted, **self._trial_and_seed_columns(wanted), **numbers})
 
     def _trial_and_seed_columns(self, trials: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the trial and seed numbers of these rows of a run table, by column; {} without them."""
         stated = {} if self.run_table is None else self.run_table.streams
         return {run_tables.RESULT_COLUMNS[name]: values[trials] for name, values in stated.items()}
 
@@ -167,6 +168,7 @@ def from_run_table(
 
 @programs.jit
 def _draw(parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Array | Row) -> dict[str, jax.Array]:
+    """Return the dispersed quantities of trials by column, (trials,) each, without a simulation."""
     return lanes.vmap(lambda trial: montecarlo.values(parts, dispersion, seed, trial))(trials)
 
 
@@ -286,6 +288,12 @@ def error_history(campaign: Campaign, trials: np.ndarray) -> tuple[np.ndarray, n
 def _simulate_error_history(
     parts: Parts, dispersion: Dispersion, seed: jax.Array, trials: jax.Array | Row, software: Software
 ) -> tuple:
+    """Simulate trials with their history.
+
+    Returns:
+        For each trial and sample, (trials, time): time [s], 2-norm of the error, and whether its period has a length.
+    """
+
     def simulate_one(trial: jax.Array | Row) -> tuple:
         trial_parts = trial_setup(parts, dispersion, seed, trial)
         log = rollout.simulate(

@@ -111,11 +111,13 @@ def connect(address: str, tls: Mapping[str, str]) -> Cluster:
 
 
 def _format_error(error: BaseException) -> str:
+    """Return the text of an error in one line, or its type if it has no text."""
     return " ".join(str(error).split()) or type(error).__name__
 
 
 @lru_cache(maxsize=4)
 def _make_campaign(make: Callable[..., tuple[Campaign, Rows]], arguments: tuple) -> tuple[Campaign, Rows]:
+    """On a worker: configure JAX, and make the campaign and its rows; equal calls get the same objects."""
     from ptsmc_jax.configure import configure
 
     with contextlib.suppress(RuntimeError):  # the worker's process has used JAX already

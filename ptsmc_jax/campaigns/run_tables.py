@@ -192,10 +192,20 @@ def check_dependent(stated: dict[str, np.ndarray], rows: pl.DataFrame, where: st
 
 
 def _column_range(columns: list[str]) -> str:
+    """Return the first and the last of these columns in words, such as "q1 to q4"."""
     return " to ".join((columns[0], columns[-1]))
 
 
 def _row_error(where: str, column: str, row: int, value: object, allowed: str) -> RefusedError:
+    """Return the error for a cell of a run table.
+
+    Args:
+        where: the name of the table.
+        column: name of the column.
+        row: number of the row, from 0.
+        value: content of the cell, or None if it is empty.
+        allowed: the allowed values, in words.
+    """
     value = value.to_list() if isinstance(value, pl.Series) else f"{value:.10g}" if isinstance(value, float) else value
     shown = "empty" if value is None else value
     return RefusedError(f"{where} has {column} {shown} in row {row}, but must have {allowed}")

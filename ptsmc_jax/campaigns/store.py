@@ -75,6 +75,7 @@ def read_versions(folder: Path) -> dict[str, Any]:
 
 
 def _read_json(path: Path) -> dict[str, Any]:
+    """Return the object in a JSON file, {} if the file cannot be read or has no object."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
@@ -287,6 +288,7 @@ def lock_folder(folder: Path, *, force: bool = True, shared: bool = False) -> It
 
 
 def _lock_file_path(folder: Path) -> Path:
+    """Return the path of the file that is locked during a run in this result folder."""
     folder = Path(os.path.realpath(folder))
     return _temporary_place(folder) / f".{folder.name}.lock"
 
@@ -454,6 +456,7 @@ def replace_file(path: Path) -> Iterator[Path]:
 
 
 def _join_array(array: re.Match[str]) -> str:
+    """Return the text of a TOML array on one line, from the match of an array with one line for each entry."""
     return "[" + ", ".join(item.strip().removesuffix(",") for item in array[1].rstrip("\n").split("\n")) + "]"
 
 

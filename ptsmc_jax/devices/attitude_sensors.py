@@ -93,6 +93,7 @@ class SampleTimes:
         return replace(self, interval=self.period, every=1, wait=self.longest_wait, split=False, pattern=(1, 1))
 
     def _time(self, sample: Any) -> Any:
+        """Return the time of a sample of the sensor [s] by its number."""
         return jnp.asarray(sample, float) * self.period
 
     def _newest_reading(self, sample: Any, latency: Any = 0.0) -> Any:

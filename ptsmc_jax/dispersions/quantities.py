@@ -89,6 +89,10 @@ def _to_matrices(rows: np.ndarray) -> np.ndarray:
 
 
 def _check_inertia(rows: np.ndarray) -> np.ndarray:
+    """Return the upper triangles (rows, 6) [kg m^2].
+
+    Raise UnfitError if a row is not the inertia of a rigid body.
+    """
     tensors = _to_matrices(rows)
     UnfitError.check(
         formulas.is_rigid_body(tensors),
@@ -174,6 +178,7 @@ def _read_wheel_failure(parts: Parts) -> Numbers:
 
 
 def _with_wheel_failure(parts: Parts, failure: Numbers) -> Parts:
+    """Return the parts with the failure time [s] and the number of the wheel, from 1 (0: none), (2,)."""
     wheel = jnp.arange(channel_directions(parts).shape[1]).astype(float) + 1.0
     return paths.put(parts, "actuators.failure_times", jnp.where(wheel == failure[1], failure[0], jnp.inf))
 
@@ -184,6 +189,7 @@ def _random_wheel_failure(random: Random, nominal: Numbers, parts: Parts) -> Num
 
 
 def _check_wheel_failure(table: TableValues, parts: Parts) -> None:
+    """Raise UnfitError if a row of the run table has a number of a wheel that the spacecraft does not have."""
     wheel, last = table["wheel_failure"][:, 1], channel_directions(parts).shape[1]
     is_valid = (wheel == np.round(wheel)) & (wheel >= 0.0) & (wheel <= last)
     UnfitError.check(is_valid, lambda row: f"a time and the number of a wheel, from 1 to {last}, or 0 for none")

@@ -225,6 +225,15 @@ def inputs(
 def _scatter_by_outcome(
     axes: Axes, x: np.ndarray, y: np.ndarray, outcome: np.ndarray, labels: Mapping[str, str]
 ) -> None:
+    """Draw a point (x, y) for each trial, with the marker of its outcome.
+
+    Args:
+        axes: where to draw.
+        x: (trials,) horizontal positions.
+        y: (trials,) vertical positions.
+        outcome: (trials,) a key of `MARKS` for each trial.
+        labels: text for the legend, by outcome.
+    """
     for name, (colour, marker, size) in MARKS.items():
         has_outcome = outcome == name
         if np.any(has_outcome):

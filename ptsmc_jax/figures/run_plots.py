@@ -271,10 +271,12 @@ def disturbance(parts: Parts, log: Log) -> Figure:
 
 
 def _error_label(parts: Parts) -> str:
+    """Return the symbol of the law's error with its unit."""
     return with_unit(parts.controller.kinematics.symbol, parts.controller.kinematics.error_unit)
 
 
 def _plot_components(axes: Axes, t: ArrayLike, values: ArrayLike, symbol: str, **kwargs: Any) -> None:
+    """Plot values (time, components) over the times t (time,), a labelled line for each component."""
     values = np.asarray(values)
     for k in range(values.shape[1]):  # more components than styles: thin lines, then pale lines
         colour, style = STYLES[k % len(STYLES)]

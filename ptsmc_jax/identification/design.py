@@ -205,6 +205,7 @@ def _predict_readings(problem: Problem, search: Search, log: Measurements) -> Me
 
 
 def _to_frame(log: Measurements) -> pl.DataFrame:
+    """Return a simulated log as a table of telemetry: t, measured_.. and sent."""
     names = {"attitude": "measured_q", "rate": "measured_w", "x": "measured_x"}
     blocks = {**{names[name]: values for name, values in log.readings.items()}, "sent": log.command}
     return pl.DataFrame({"t": log.t, **runs.numbered_columns(blocks)})

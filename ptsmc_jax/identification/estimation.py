@@ -254,6 +254,7 @@ def estimate_parameters(
 
 
 def _log_kind(log: Measurements) -> LogKind:
+    """Return the properties of a log that select the compiled filter."""
     return LogKind(log.by_channel, log.wheel_inertia)
 
 
@@ -423,6 +424,7 @@ class Search:
         return best
 
     def _begin_round(self, text: str) -> None:
+        """Report that a round of the search begins; text: its name."""
         self._round = text
         self.report(f"{self._start}, {text}")
 
@@ -490,6 +492,13 @@ class Search:
     def _screen_and_maximise(
         self, z: np.ndarray, screenings: int = MAX_SCREENINGS, tolerance: float = STEP_TOLERANCE
     ) -> SearchResult:
+        """Reject outliers and maximise the likelihood in turn, until the same readings are rejected.
+
+        Args:
+            z: (n,) starting point.
+            screenings: largest number of rounds.
+            tolerance: largest next step of a converged maximisation, in sigmas of the estimate.
+        """
         previous_masks, result = None, None
         for _ in range(screenings):
             logs = [self.reject_outliers(z, log) for log in self.logs]
@@ -693,6 +702,16 @@ def _build_result(
     logs: Sequence[Measurements],
     validation_logs: Sequence[Measurements],
 ) -> Identification:
+    """Return the identification with covariances, fits and warnings.
+
+    Args:
+        loaded: the scenario.
+        problem: the parameters.
+        search: the search, which rejects outliers.
+        best: its best result.
+        logs: the logs of the estimate.
+        validation_logs: logs that are only predicted.
+    """
     z, zero = best.z, np.zeros(problem.size)
     by_z, by_start = problem.derivatives(z), problem.derivatives(zero)
     has_prior = [parameter.has_prior for parameter in problem.parameters for _ in parameter.labels]

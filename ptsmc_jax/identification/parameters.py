@@ -104,6 +104,8 @@ class Problem:
 
     @cached_property
     def _jitted_numbers(self) -> Callable[[Array], Array]:
+        """The compiled function from coordinates (n,) to the numbers of all parameters, joined in their order."""
+
         def read(z: Array) -> Array:
             model = self.model_at(z)
             return jnp.concatenate([jnp.ravel(parameter.read(model)) for parameter in self.parameters])
@@ -480,6 +482,7 @@ def _misalignment_parameter(model: Model, axes: np.ndarray, sigmas: np.ndarray, 
 
 
 def _coupling_parameter(model: Model, sigmas: np.ndarray, has_prior: bool) -> Parameter:
+    """Return the parameter of the mode coupling (modes, 3). Its coordinates are relative to the norm of each row."""
     row_norms = np.linalg.norm(np.asarray(model.plant.coupling), axis=1, keepdims=True) * np.ones(3)
 
     def put(model: Model, new: Array) -> Model:
@@ -535,4 +538,5 @@ def inertia_derivatives(root: np.ndarray) -> np.ndarray:
 
 
 def _upper_triangle(inertia: Array) -> Array:
+    """Return the upper triangle (6,) of an inertia (3, 3), in the order of `PAIRS`."""
     return jnp.stack([inertia[i, j] for i, j in PAIRS])

@@ -83,6 +83,7 @@ def _write_estimate(
 
 
 def _relative_dispersion(std: np.ndarray, values: np.ndarray) -> dict[str, object]:
+    """Return the table of a relative dispersion: largest ratio of 1 sigma to the value, at most `MAX_STD`."""
     is_uncertain = std > 0.0  # a value of zero may be fixed
     largest = min(np.max(std[is_uncertain] / np.abs(values[is_uncertain]), initial=0.0), MAX_STD)
     return {"kind": "relative_normal", "std": float(largest)}

@@ -165,6 +165,7 @@ def _iso_to_seconds(cell: str | None) -> float:
 
 
 def _numbered_columns(prefix: str, count: int) -> list[str]:
+    """Return names such as "q1", "q2" for a prefix and a number of columns."""
     return [f"{prefix}{k + 1}" for k in range(count)]
 
 

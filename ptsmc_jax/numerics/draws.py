@@ -125,10 +125,12 @@ def streams(seed: WholeNumber, trial: WholeNumber, names: Sequence[str]) -> list
 
 
 def _hash_name(name: str) -> int:
+    """Return the CRC-32 of the name of a stream."""
     return zlib.crc32(name.encode())
 
 
 def _stream_key(seed: WholeNumber, trial: WholeNumber, name_hash: Word) -> Key:
+    """Return the key of a stream from seed, trial and the hash of its name."""
     return Key(*threefry(Key(_to_scalar_word(seed), jnp.uint32(0)), (_to_scalar_word(trial), name_hash)))
 
 
@@ -223,6 +225,7 @@ def draw_streams(
 def _draw_streams(
     seed: Word, trial: Word, distribution: Distribution, counts: tuple[tuple[str, int], ...]
 ) -> dict[str, Array]:
+    """Return the numbers (count,) of each stream, by name; `counts`: pairs of name and count, see `draw_streams`."""
     blocks = [(_hash_name(name), block) for name, count in counts for block in range((count + 1) // 2)]
 
     def draw_pair(row: Word) -> tuple[Array, Array]:

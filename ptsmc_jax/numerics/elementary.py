@@ -61,6 +61,7 @@ def log(x: Float[Array, "..."]) -> Float[Array, "..."]:
 
 @log.defjvp
 def _log_jvp(primals: tuple, tangents: tuple) -> tuple:
+    """Return ln x and its derivative."""
     return log(*primals), tangents[0] / primals[0]
 
 
@@ -86,6 +87,7 @@ def cos_sin_turns(u: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Ar
 
 @cos_sin_turns.defjvp
 def _cos_sin_turns_jvp(primals: tuple, tangents: tuple) -> tuple:
+    """Return cosine and sine of an angle in turns, and their derivatives."""
     cosine, sine = cos_sin_turns(*primals)
     change = 2.0 * np.pi * tangents[0]
     return (cosine, sine), (-sine * change, cosine * change)
@@ -107,6 +109,7 @@ def arctan2(y: Float[Array, "..."], x: Float[Array, "..."]) -> Float[Array, "...
 
 @arctan2.defjvp
 def _arctan2_jvp(primals: tuple, tangents: tuple) -> tuple:
+    """Return the angle and its derivative, which is 0 at the origin."""
     (y, x), (dy, dx) = primals, tangents
     square = x * x + y * y
     at_zero = square == 0.0

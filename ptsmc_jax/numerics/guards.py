@@ -37,6 +37,7 @@ def sqrt(square: Float[Array, "..."]) -> Float[Array, "..."]:
 
 @sqrt.defjvp
 def _sqrt_jvp(primals: tuple, tangents: tuple) -> tuple:
+    """Return the root and its derivative, which is 0 at zero."""
     root = sqrt(*primals)
     at_zero = root == 0.0
     return root, jnp.where(at_zero, 0.0, tangents[0] * 0.5 / jnp.where(at_zero, 1.0, root))

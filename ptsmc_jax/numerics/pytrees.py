@@ -45,6 +45,10 @@ def listing(self: Any, indent: str = "") -> str:
 
 
 def _format_value(value: Any, indent: str) -> str:
+    """Return the text of a field: the numbers of a small array, type and shape of a large one.
+
+    A text of several lines begins on a new line and is indented more than `indent`.
+    """
     if isinstance(value, jax.Array | np.ndarray) and not isinstance(value, core.Tracer):
         is_deleted = isinstance(value, jax.Array) and value.is_deleted()  # its buffer was donated
         if is_deleted or value.size > MAX_SHOWN or not jnp.issubdtype(value.dtype, np.number):

@@ -138,6 +138,7 @@ def _check_accuracy(where: str, claim: str, stated: float, cases: dict[str, Run]
 
 
 def _check_larger_eta_is_more_accurate(cases: dict[str, Run]) -> Claim:
+    """Check that the errors at and after t_f are smaller for eta = 5 than for eta = 3; `cases`: runs by case."""
     low, high = (_error_at_and_after_t_f(cases[name]) for name in ("case_2_eta_3", "case_2_eta_5"))
     better = high[1] < 0.5 * low[1] and high[0] < 0.5 * low[0]
     return Claim(
@@ -167,6 +168,7 @@ def _check_initial_torque(where: str, claim: str, cases: dict[str, Run], larger:
 
 
 def _check_larger_eta_is_faster(cases: dict[str, Run]) -> Claim:
+    """Check that 1 % of the initial error is reached earlier for eta = 5 than for eta = 3; `cases`: runs by case."""
     slow, fast = (_time_to_one_percent(cases[name]) for name in ("case_2_eta_3", "case_2_eta_5"))
     return Claim(
         "4.2 B",
@@ -179,6 +181,7 @@ def _check_larger_eta_is_faster(cases: dict[str, Run]) -> Claim:
 
 
 def _check_convergence_within_t_f(cases: dict[str, Run]) -> Claim:
+    """Check that the error of each spacecraft case is below `STABILISED` of its initial value from t_f on."""
     ratios = {name: _error_at_and_after_t_f(cases[name])[1] / float(_error_norm(cases[name])[0]) for name in SPACECRAFT}
     worst = max(ratios.values())
     return Claim(
@@ -192,6 +195,7 @@ def _check_convergence_within_t_f(cases: dict[str, Run]) -> Claim:
 
 
 def _check_independence_of_start() -> Claim:
+    """Check the times to 1 % of the initial error from 20, 80 and 140 degrees, without and with a disturbance."""
     times, spread = {}, {}
     quiet = {"disturbance": NO_DISTURBANCE, "controller": {"t_f": 35.0, "disturbance_rate_bound": 0.0}}
     for kind, tables in (("quiet", quiet), ("disturbed", {"controller": {"t_f": 35.0}})):
@@ -215,6 +219,7 @@ def _check_independence_of_start() -> Claim:
 
 
 def _check_no_singularity(cases: dict[str, Run]) -> Claim:
+    """Check that the input near t_f is smaller than the first input, in each case."""
     ratios = {}
     for name, run in cases.items():
         t_f = float(run.parts.controller.t_f)
@@ -255,6 +260,7 @@ def _check_sampled_torque_peaks(cases: dict[str, Run]) -> Claim:
 
 
 def _check_stays_at_origin(cases: dict[str, Run]) -> Claim:
+    """Check that the error after t_f is less than ten times the error at t_f (case 1)."""
     at_t_f, after_t_f = _error_at_and_after_t_f(cases["case_1_30"])
     return Claim(
         "(23), (34), (51)",
@@ -326,4 +332,5 @@ def format_observers(measured: list[Measured]) -> tuple[tuple[str, ...], list[tu
 
 
 def _format_time(time: float) -> str:
+    """Return a time [s] with two decimals, or "never" for NaN."""
     return "never" if np.isnan(time) else f"{time:.2f}"

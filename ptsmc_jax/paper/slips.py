@@ -209,9 +209,11 @@ class _Unaligned(AdditiveKinematics):
     """The attitude error as printed in the paper, without a choice of the sign of q."""
 
     def align(self, x: rigid_body.AttitudeState, target: Target) -> rigid_body.AttitudeState:
+        """Return the state unchanged."""
         return x
 
     def singularity_distance(self, x: rigid_body.AttitudeState, target: Target) -> jax.Array:
+        """Return |q4|."""
         return jnp.abs(x.q[3])
 
 

@@ -56,10 +56,12 @@ def paths_of(parts: Parts) -> dict[str, str]:
 
 
 def _gain_at(parts: Parts, path: str) -> Any:
+    """Return the gain at a path of the parts."""
     return parts.sensors.bandwidth(parts.period) if path == BANDWIDTH else paths.get(parts, path)
 
 
 def _with_gain_at(parts: Parts, path: str, value: Any) -> Parts:
+    """Return the parts with another gain at a path; one observer gain is used for all axes."""
     if path == BANDWIDTH:
         return replace(parts, sensors=parts.sensors.with_bandwidth(value, parts.period))
     if path == T_F:

@@ -139,6 +139,7 @@ class Running(NamedTuple):
 
 
 def _zero(start: Start, criteria: Criteria) -> Array:
+    """Return the initial accumulator 0."""
     return jnp.zeros_like(criteria.t_f)
 
 
@@ -217,10 +218,12 @@ def _squared_angles(interval: Interval, errors: Errors) -> tuple[Array, Array, A
 
 
 def _largest_component(torques: tuple[Array, ...]) -> Array:
+    """Return the largest absolute component of several torques (m,)."""
     return jnp.max(jnp.stack([jnp.max(jnp.abs(u)) for u in torques]))
 
 
 def _largest_value(wheel_values: Any) -> Array:
+    """Return the largest absolute value of an array."""
     return jnp.max(jnp.abs(wheel_values))
 
 
@@ -230,12 +233,14 @@ def _limited_fraction(memory: Array, running: Running, criteria: Criteria) -> Ar
 
 
 def _add_effort(memory: Array, interval: Interval, criteria: Criteria) -> Array:
+    """Return the effort after an interval: the integral of the 1-norm of the delivered torque."""
     torques = interval.torques
     norms = (w * jnp.sum(jnp.abs(u)) for w, u in zip(torques.weights, torques.delivered, strict=True))
     return memory + interval.length * sum(norms)
 
 
 def _is_unsettled(snapshot: Snapshot, criteria: Criteria) -> Array:
+    """Return whether the angle is not below the settling angle."""
     return ~(snapshot.angle < criteria.settling_angle)  # true if the angle is NaN
 
 
@@ -258,6 +263,7 @@ def _add_torque_variation(memory: Array, interval: Interval, errors: Errors, cri
 
 
 def _variation_per_second(memory: Array, running: Running, criteria: Criteria) -> Array:
+    """Return the total variation after t_f per second, of the component with the largest one."""
     length = criteria.t_end - criteria.t_f
     return jnp.max(memory) / jnp.where(length > 0.0, length, 1.0)
 
@@ -371,6 +377,7 @@ class Metrics(dict[str, Any]):
 
 
 def _format_value(value: Any) -> str:
+    """Return the text of a metric: a number with six digits, type and shape of an array."""
     if not isinstance(value, jax.Array | np.ndarray | np.number | float):
         return repr(value)  # under transformations a leaf may be a shape or an axis
     is_array = isinstance(value, core.Tracer) or np.ndim(value) > 0

@@ -151,6 +151,12 @@ class Verdict:
         return self._describe_time(self.fraction_of_time, self.quantile)
 
     def _describe_time(self, fraction: float, quantile: float) -> str:
+        """Return the verdict on a fraction of the time in words.
+
+        Args:
+            fraction: observed fraction of the time within the limit.
+            quantile: required fraction.
+        """
         limit = quantity(self.limit, self.unit, 6, self.metric)
         population = INTERPRETATIONS[self.interpretation]
         requirement = f"{self.metric} at most {limit} in {100 * quantile:g} % of {population}"
@@ -163,6 +169,7 @@ class Verdict:
         return f"{requirement}: {result}: {self.word}{self._describe_missing_trials('runs')}"
 
     def _describe_trials(self) -> str:
+        """Return the verdict on the trials in words: requirement, worst value and reason."""
         failures, trials, worst = self.failures, self.trials, self.worst
         noun = "loops" if self.metric in MARGINS else "trials"  # margins may be computed for more loops than trials
         limit = quantity(self.limit, self.unit, 6, self.metric)

@@ -387,6 +387,7 @@ def is_not_converged(angle_at_t_f: Scalar, initial_angle: Scalar, settling_angle
 
 
 def _snapshot(parts: Parts, target: PyTree, x: PyTree) -> Snapshot:
+    """Return the quantities of a state x that metrics use; target: the reference."""
     angle, plant = parts.controller.kinematics.angle(x, target), parts.plant
     momentum = plant.momentum(x)
     momentum_norm = None if momentum is None else guards.norm(momentum)
@@ -445,6 +446,7 @@ def _check_continuous(parts: Parts) -> None:
 
 
 def _check_shape(name: str, value: object, allowed: list[tuple[int, ...]]) -> None:
+    """Raise TypeError if a value is not an array of an allowed shape; the message names the first one."""
     shape = getattr(value, "shape", None)
     if shape not in allowed:
         actual = f"of type {type(value).__name__}" if shape is None else f"one of shape {shape}"

@@ -88,6 +88,11 @@ class LocalCoordinates:
         self.sizes = [plant_part.size, seen_part.size, sensor_part.size, wheels, other_part.size]
 
     def _other_floats(self, carry: Carry) -> Any:
+        """Return the floats of a carry that no other block has.
+
+        They are actuator torques, observer, applied torque, actuator model, sensors without coordinates, law and
+        command filter.
+        """
         computer = carry.computer
         sensor_floats = None if self._has_sensor_coordinates else _float_leaves(computer.sensors)
         law_and_filter = _float_leaves(computer.law), computer.command_filter

@@ -94,6 +94,7 @@ def error_bound(parts: Parts, t: ArrayLike) -> np.ndarray:
 
 @programs.jit
 def _error_bound(parts: Parts, t: Array, s0: Scalar, residual: Scalar) -> Array:
+    """Return the bound of `error_bound` at times t (time,) [s]; `s0`, `residual`: from `sliding_envelope`."""
     law = parts.controller
 
     def component_bound(time: Scalar, x0: Vector) -> Scalar:
@@ -152,4 +153,5 @@ def hold_rates(law: PrescribedTimeLaw) -> dict[str, float]:
 
 @programs.jit  # one compiled program instead of one for each operation
 def _rates_of_hold(law: PrescribedTimeLaw) -> tuple[Scalar, Float[Array, " roots"]]:
+    """Return the decay rate toward the surface [1/s], and the gains of the surface."""
     return law.reaching_rate, law.surface()

@@ -294,6 +294,15 @@ def map_in_batches(function: Callable[[Any], Any], items: Any, size: int) -> Any
 def _linearise_batch(
     parts: Parts, nominal_periods: NominalRun, widths: Array | None, fractional_delays: bool
 ) -> LinearisedPeriod:
+    """Linearise several control periods, which are the first axis of the arguments and the result.
+
+    Args:
+        parts: the scenario.
+        nominal_periods: the nominal run in these periods.
+        widths: thickness of the boundary layer in each period; None: that of the law.
+        fractional_delays: see `linearise_period`.
+    """
+
     def linearise(nominal_period: NominalRun, width: Any) -> LinearisedPeriod:
         changed = parts
         if width is not None:

@@ -135,6 +135,7 @@ def _nonzero_periods(parts: Parts, log: Log) -> tuple[Any, Any]:
 
 @programs.jit
 def _ticks(clock: Any, t_f: Array, delta: Array) -> Ticks:
+    """Return all control periods of a clock, the first axis."""
     return clock.ticks(t_f, delta)
 
 

@@ -207,6 +207,7 @@ def plant_motion(kinematics: Kinematics, target: Any, start: Any, errors: Errors
 
 @plant_motion.register
 def _(kinematics: AdditiveKinematics, target: Any, start: Any, errors: Errors) -> Motion:
+    """Return the motion for the error q_1 - q_1f; see `plant_motion`."""
     # q4^2 = 1 - |v|^2 is the distance to the singularity; at or below 0 the path leaves the unit ball
     error, error_rate, acceleration = errors
     rate_f, acceleration_f = attitude.vector_rates(*target)
@@ -218,6 +219,7 @@ def _(kinematics: AdditiveKinematics, target: Any, start: Any, errors: Errors) -
 
 @plant_motion.register
 def _(kinematics: MultiplicativeKinematics, target: Any, start: Any, errors: Errors) -> Motion:
+    """Return the motion for the vector part of q_f* q; see `plant_motion`."""
     # q_e4^2 = 1 - |v|^2 is the distance to the singularity
     error, error_rate, acceleration = errors
     q_e, square = attitude.from_vector_part(error, jnp.ones(()))
@@ -231,6 +233,7 @@ def _(kinematics: MultiplicativeKinematics, target: Any, start: Any, errors: Err
 
 @plant_motion.register
 def _(kinematics: SecondOrderKinematics, target: Any, start: Any, errors: Errors) -> Motion:
+    """Return the motion of a custom second-order system; see `plant_motion`."""
     # Newton's method solves F(t, x_1, x_2) = x_1' for x_2 from the initial x_2, in one step if F is linear in x_2
     error, error_rate, acceleration = errors
     model, n = kinematics.model, kinematics.model.inputs
@@ -330,6 +333,7 @@ def visited_states(parts: Parts) -> tuple[Array, Any]:
 
 @programs.jit
 def _visited_states(parts: Parts) -> tuple[Array, Any]:
+    """Return targets and states at 2 `VISITED` points of a run, see `visited_states`."""
     law, fractions = parts.controller, jnp.linspace(0.0, 1.0, VISITED)
     zero_errors = (jnp.zeros(parts.plant.inputs),) * 3
 
