@@ -353,4 +353,5 @@ def reproduce() -> Reproduced:
 
 
 def _to_scenario(what: Scenario | Study | str | Path) -> Scenario:
+    """Return a scenario: itself, that of a study, or that of a file."""
     return reading.to_scenario(what.scenario if isinstance(what, Study) else what)

@@ -29,5 +29,6 @@ def command() -> None:
 
 
 def _interrupt(signum: int, frame: FrameType | None) -> None:
+    """Signal handler: raise KeyboardInterrupt. A second signal ends the process at once."""
     signal.signal(signum, signal.SIG_DFL)
     raise KeyboardInterrupt

@@ -321,6 +321,17 @@ def _configure_jax(folder: Path) -> None:
 
 
 def _summarise(folder: "Folder", quiet: bool, figures: bool, *, write: bool = True) -> int:
+    """Summarise a campaign, and write and print its results.
+
+    Args:
+        folder: the folder of the campaign.
+        quiet: print nothing.
+        figures: write figures, too.
+        write: write `summary.json` and the figures.
+
+    Returns:
+        The exit status: 0 if every requirement is met, otherwise 1.
+    """
     from tuning.studies import campaign_summary
 
     with Progress(quiet) as report:
@@ -336,6 +347,7 @@ def _summarise(folder: "Folder", quiet: bool, figures: bool, *, write: bool = Tr
 
 
 def _parse_shard(value: str) -> tuple[int, int]:
+    """Return I and N of the option --shard I/N, from 1; raise UsageError if they are not valid."""
     index, _, count = value.partition("/")
     try:
         parsed = int(index), int(count)

@@ -80,6 +80,15 @@ def attitude_lines(q: np.ndarray, sequence: str | None = None) -> list[str]:
 
 
 def _parse_numbers(key: str, text: str) -> list[float]:
+    """Return the numbers in the text of an option, separated by commas or spaces.
+
+    Args:
+        key: name of the option in Python, for the error.
+        text: the text.
+
+    Raises:
+        UsageError: the text has something else than numbers.
+    """
     try:
         return [float(part) for part in re.split(r"[,\s]+", text.strip(" []()"))]
     except ValueError:
@@ -87,8 +96,10 @@ def _parse_numbers(key: str, text: str) -> list[float]:
 
 
 def _option_name(key: str) -> str:
+    """Return an option as the user writes it, such as "--euler-deg" for "euler_deg"."""
     return f"--{key.replace('_', '-')}"
 
 
 def _format_numbers(values: object) -> str:
+    """Return numbers (n,) as a list in TOML, rounded."""
     return "[" + ", ".join(f"{v + 0.0:.{DIGITS}g}" for v in np.round(np.asarray(values, dtype=float), DIGITS + 2)) + "]"

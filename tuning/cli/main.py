@@ -410,6 +410,7 @@ def _describe_unused_arguments(error: UnusedCliTokensError) -> str:
 
 
 def _is_configuration_error(error: BaseException) -> bool:
+    """Return whether an error means that the user's input is not allowed, which has exit status 2."""
     from ptsmc_jax.campaigns.store import RefusedError
     from ptsmc_jax.scenario.errors import ScenarioError
 

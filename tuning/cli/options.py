@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 
 def _parse_integer(_: object, tokens: Sequence[Token]) -> int:
+    """Return the whole number of an option; raise ValueError for other texts."""
     text = tokens[0].value
     if not text.removeprefix("-").isdecimal():  # cyclopts would round 2.5
         raise ValueError(f"{text} is no whole number")

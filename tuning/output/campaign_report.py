@@ -163,6 +163,7 @@ def pointing_sections(summary: Campaign) -> list[Section]:
 
 
 def _is_pointing_index(metric: str) -> bool:
+    """Return whether a metric is a pointing error index about an axis."""
     index, _, axis = metric.rpartition("_")
     return index in INDICES and axis in AXES
 
@@ -354,6 +355,7 @@ def replay_lines(difference: float | None, history_difference: float, tolerance:
 
 
 def _describe_difference(difference: float) -> str:
+    """Return in words how much a replayed row differs from the stored row."""
     if difference == float("inf"):
         return "it ends with another status, or other values are missing"
     return f"largest relative difference {difference:.1e}"

@@ -182,6 +182,7 @@ def build(summary: Compare) -> Report:
 
 
 def _has_answer(question: Question, laws: dict[str, Law]) -> bool:
+    """Return whether a law has a value that the question reads."""
     return any(value.read(law) is not None for value in question.values for law in laws.values())
 
 
@@ -302,4 +303,5 @@ def most_accurate_law(laws: dict[str, Law]) -> str:
 
 
 def _readable_name(law: str) -> str:
+    """Return the name of a law in words."""
     return "published gains" if law == "published" else law.replace("_", " ")

@@ -178,9 +178,11 @@ def _format_value(value: float) -> str:
 
 
 def _list_values(front: Front, values: Sequence[float]) -> str:
+    """Return values of the traded quantity in one text, separated by commas, with their unit."""
     return f"{', '.join(map(_format_value, values))} {KINDS[front.against].unit_for(front.plant)}"
 
 
 def _describe_marks(point: Point) -> str:
+    """Return the marks of a point in words: knee, meets, number of failed trials; empty without marks."""
     words = [word for word, is_so in (("knee", point.knee), ("meets", point.meets)) if is_so]
     return ", ".join([*words, *([f"{point.failures} failed or not converged"] if point.failures else [])])

@@ -33,6 +33,7 @@ def build(summary: Margins) -> Report:
 
 
 def _format_worst(summary: Margins) -> str:
+    """Return the line with the smallest margins of the run, and the phases that they are from."""
     phases = "both phases" if any(loop["judged"] for loop in summary.before) else "the hold phase"
     return f"smallest margins at one input in {phases}: {format_margins(summary.worst)}"
 
@@ -169,4 +170,5 @@ def format_margins(margins: Numbers) -> str:
 
 
 def _short_name(name: str) -> str:
+    """Return the short name of a margin, such as "gain" for "gain_margin"."""
     return "max |S|" if name == "peak_sensitivity" else name.removesuffix("_margin")

@@ -26,6 +26,7 @@ PANELS = {
 
 
 def _layout(**others: object) -> Chart:
+    """Return the Plotly layout of all charts; others: further or other entries."""
     return {
         "template": {"layout": {"font": {"family": "system-ui, sans-serif", "size": 13}, "colorway": COLOURS}},
         "margin": {"l": 70, "r": 50, "t": 40, "b": 50},
@@ -113,6 +114,15 @@ def attitude(t: np.ndarray, q: np.ndarray) -> Chart:
 
 
 def _line_3d(points: np.ndarray, name: str, colour: str, width: int, dash: str = "solid") -> Chart:
+    """Return the Plotly trace of a line in three dimensions.
+
+    Args:
+        points: (n, 3) points of the line.
+        name: name in the legend.
+        colour: colour of the line.
+        width: width of the line [pixels].
+        dash: style of the line.
+    """
     x, y, z = (to_json_numbers(points[:, k]) for k in range(3))
     return {"type": "scatter3d", "mode": "lines", "name": name, "x": x, "y": y, "z": z, "hoverinfo": "name",
             "line": {"color": colour, "width": width, "dash": dash}}  # fmt: skip

@@ -81,6 +81,7 @@ class Bar:
         return rate
 
     def _print_periodically(self) -> None:
+        """Print the progress to stderr every `INTERVAL` seconds until the command ends."""
         while not self._ended.wait(INTERVAL):
             text = self.__rich__()
             with contextlib.suppress(OSError):  # a closed pipe or a full disk is no reason to stop

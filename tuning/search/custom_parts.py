@@ -159,6 +159,12 @@ def is_self_contained(file: Path) -> bool:
 
 
 def _report_custom_code(programs: Mapping[str, str], source: Path) -> None:
+    """Print to stderr which existing files of custom code the command runs.
+
+    Args:
+        programs: place of the code, by the key of the scenario.
+        source: the file that has the keys.
+    """
     for file, keys in _group_by_file(programs).items():
         if os.path.isabs(file) and not os.path.exists(file):
             continue  # the command refuses an absent file

@@ -167,6 +167,7 @@ _ADDRESS = re.compile("0x[0-9a-f]+")  # address of a custom function, different 
 
 
 def _encode(problem: Problem) -> bytes:
+    """Return bytes that are equal for equal problems, also in another process."""
     leaves, structure = jax.tree.flatten(problem)
     structure_text = _ADDRESS.sub("", str(structure)).encode()
     return b"|".join([structure_text, *(np.asarray(leaf).tobytes() for leaf in leaves)])
@@ -174,6 +175,10 @@ def _encode(problem: Problem) -> bytes:
 
 @programs.jit(compiler_options=programs.FAST_COMPILE)
 def _gains_with_derivatives(normalised: jax.Array, scale: Scale) -> dict[str, jax.Array]:
+    """Return "gains" (points, gains) in their units, and "along", the direction of the gains for each normalised gain.
+
+    "along" has the shape (points, normalised gains, gains).
+    """
     derivatives = jax.vmap(jax.jacfwd(scale.gains))(normalised)
     return {"gains": jax.vmap(scale.gains)(normalised), "along": jnp.swapaxes(derivatives, 1, 2)}
 

@@ -48,6 +48,7 @@ class Journal:
 
 
 def _pack_record(record: Mapping[str, np.ndarray]) -> bytes:
+    """Return a record of arrays by name as bytes, preceded by length and CRC-32."""
     buffer = io.BytesIO()
     np.savez(buffer, **record)  # pyright: ignore[reportArgumentType]
     data = buffer.getvalue()

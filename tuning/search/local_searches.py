@@ -435,6 +435,7 @@ class LocalSearches:
             self._best = next((best for best in reversed(cumulative) if self._is_as_good(best)), current)
 
     def _is_as_good(self, best: Best) -> bool:
+        """Return whether a point has no larger violation than the best point, and F is at most `SAME_F` larger."""
         return best.infeasibility <= self.best.infeasibility and best.f <= self.best.f + SAME_F
 
     def _try_other_hand_overs(self, problem: Problem) -> bool:

@@ -143,6 +143,7 @@ class Rounds:
             self.hardest = worst_case.find_hardest(self.problem, self._on_every_trial, gains, self._screening)
 
     def _screen(self, gains: np.ndarray) -> worst_case.Screened:
+        """Return the screened trials for gains (gains,), see `worst.screen`, and count the rollouts."""
         self._evaluate.rollouts += worst_case.SCREENED
         return worst_case.screen(self.problem, self._on_every_trial, gains)
 

@@ -125,6 +125,7 @@ def simulate_with_derivatives(
 
 
 def _no_shifts(batch: Batch, directions: int) -> dict[str, np.ndarray]:
+    """Return zero shifts (trials, directions, numbers) of each differentiable dispersion, by name."""
     return {
         name: np.zeros((len(v), directions, *np.shape(v)[1:]))
         for name, v in batch.coordinates.items()

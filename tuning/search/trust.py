@@ -158,6 +158,15 @@ def ratio_interval(numerator: np.ndarray, denominator: np.ndarray) -> tuple[floa
 
 
 def _bootstrap_interval(samples: tuple, statistic, *, paired: bool) -> tuple[float, float] | None:
+    """Return the bootstrap confidence interval of a statistic, or None.
+
+    The result is None for fewer than 8 values, for equal values, and if an end is not finite.
+
+    Args:
+        samples: arrays (trials,), the arguments of the statistic.
+        statistic: function of these arrays and an axis.
+        paired: resample the same trials of all arrays.
+    """
     if len(samples[0]) < 8 or all(np.ptp(one) == 0.0 for one in samples):
         return None
     from scipy import stats  # imported here because the import takes half a second

@@ -124,7 +124,7 @@ class Folder:
         if self.custom_metrics is None:
             return []
         if self.stored_versions is None:
-            return self._with_custom_metrics.custom_metric_names()
+            return self._campaign_without_table.custom_metric_names()
         return list(self.stored_versions.metrics_names or ())
 
     @property
@@ -191,6 +191,7 @@ class Folder:
 
     @property
     def _untrusted_code_error(self) -> RefusedError:
+        """The error for custom code in a folder that is read without --trust."""
         return RefusedError(f"{self.path} names custom code, which is run with --trust only")
 
     @cached_property
@@ -225,11 +226,11 @@ class Folder:
         Raises ScenarioError if the custom metrics are invalid, and RefusedError if the campaign needs untrusted code.
         """
         # before `campaign_without_metrics`, so that errors of the metrics are raised first
-        custom_metrics = self._with_custom_metrics.custom_metrics
+        custom_metrics = self._campaign_without_table.custom_metrics
         return replace(self.campaign_without_metrics, custom_metrics=custom_metrics)
 
     @cached_property
-    def _with_custom_metrics(self) -> Campaign:
+    def _campaign_without_table(self) -> Campaign:
         """The campaign with custom metrics, but without the run table."""
         if self.ready is None or (self.custom_metrics is not None and not self.trusted):
             raise self._untrusted_code_error
@@ -248,6 +249,7 @@ class Folder:
             raise ScenarioError(f"--metrics is {self.custom_metrics}: {error}") from None
 
     def _check_unchanged(self, key: str) -> None:
+        """Raise RefusedError if the file of a key has another content than in the stored campaign."""
         if self.stored_versions is not None:
             custom_parts.check_unchanged({key: self.code_and_data_files[key]}, self.path, self.identity)
 

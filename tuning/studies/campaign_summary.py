@@ -80,6 +80,13 @@ def _fraction_of_time_beyond(frame: pl.DataFrame, requirement: Requirement, fini
 
 
 def _verdict_entry(verdict: Verdict, requirement: Requirement, beyond: np.ndarray) -> dict[str, Any]:
+    """Return the entry of a requirement in `summary.json`, with the observed fraction, its interval and its bound.
+
+    Args:
+        verdict: the verdict on the requirement.
+        requirement: the requirement.
+        beyond: (trials,) fraction of time of each trial beyond the limit; empty if the requirement counts trials.
+    """
     within, confidence = verdict.trials - verdict.failures, requirement.confidence or CONFIDENCE
     entry = verdict.in_summary()
     if beyond.size:  # fraction of time: the samples of one run depend on each other, but the runs are independent

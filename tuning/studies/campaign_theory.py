@@ -58,6 +58,7 @@ def prepare(folder: "Folder") -> None:
 
 
 def _lacks_theory(folder: "Folder") -> bool:
+    """Return whether lower bound or margins of a campaign are still to be computed."""
     theory = read(folder)
     return "lower_bound" not in theory or bool(margins_without_verdict(folder, theory))
 

@@ -130,6 +130,7 @@ def read(summary: Mapping[str, Any]) -> Front:
 
 
 def _read_point(stored: Mapping[str, Any]) -> Point:
+    """Return a point of a front from its entry in `summary.json`."""
     entries = {field_.name: stored[field_.name] for field_ in fields(Point)}
     numbers = {name: _nan_if_missing(entries[name]) for name in ("value", "rms", "trained")}
     costs = {name: _nan_if_missing(value) for name, value in entries["costs"].items()}
@@ -137,4 +138,5 @@ def _read_point(stored: Mapping[str, Any]) -> Point:
 
 
 def _nan_if_missing(value: float | None) -> float:
+    """Return the number, or NaN for None."""
     return math.nan if value is None else value

@@ -122,6 +122,7 @@ def _plot_observers(measured: list[Measured]) -> Figure:
 
 
 def _markdown(reproduction: Reproduction) -> str:
+    """Return the text of `claims.md`: claims, errors in equations, observers."""
     claim_rows = [(c.where, c.claim, c.measured, f"**{c.verdict}**", c.why) for c in reproduction.claims]
     shown = [(s.where, s.paper, s.correct, s.shown) for s in reproduction.slips]
     return "\n".join(
@@ -143,5 +144,6 @@ def _markdown(reproduction: Reproduction) -> str:
 
 
 def _markdown_table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> list[str]:
+    """Return the lines of a Markdown table with this header and these rows of cells."""
     cells = [header, tuple("---" for _ in header), *rows]
     return ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in cells]

@@ -84,6 +84,7 @@ def _limit_cycle_entry(scenario: Scenario, limit_cycle: LimitCycle) -> dict[str,
 
 
 def _finite_or_none(value: float) -> float | None:
+    """Return the number, or None if it is not finite."""
     return float(value) + 0.0 if np.isfinite(value) else None  # + 0.0 replaces -0 by 0
 
 

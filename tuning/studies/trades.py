@@ -418,4 +418,5 @@ def _with_requirements(scenario: Scenario, limits: dict[str, float], without: Se
 
 
 def _join_values(values: Sequence[float]) -> str:
+    """Return values in one text, separated by commas, whole numbers without decimals."""
     return ",".join(str(float(value)).removesuffix(".0") for value in values)
