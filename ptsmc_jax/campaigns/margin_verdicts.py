@@ -246,7 +246,8 @@ def _loops_and_margins(
 ) -> tuple[linear.Loop, dict[str, Array], Array]:
     """Return the loops of each trial, (trials, times, ..), their interpolated margins, and which are open in hold.
 
-    The margins are the worst over the axes. A loop that is open in the hold phase has NaN.
+    The margins are arrays (trials, times) by name, the worst over the axes. A loop that is open in the hold phase has
+    NaN. The last result is bool, (trials, times).
 
     with_delay: the loops allow delays by a fraction of a period, see `linear.linearise_period`.
     """

@@ -236,7 +236,7 @@ def _finite_numbers(table: pl.DataFrame, column: str, where: str) -> np.ndarray:
 
 
 def _to_numbers(values: pl.Series) -> np.ndarray:
-    """Return the numbers of a column; an empty cell or text is NaN."""
+    """Return the numbers of a column, (rows,); an empty cell or text is NaN."""
     if values.dtype.is_numeric() or values.dtype == pl.String:
         return values.cast(pl.Float64, strict=False).to_numpy().astype(float)
     return np.full(values.len(), np.nan)

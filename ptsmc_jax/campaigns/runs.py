@@ -75,9 +75,9 @@ class Run:
         return {"t": np.asarray(log.t), **numbered_columns(blocks)}
 
     def _measured_columns(self) -> dict[str, np.ndarray]:
-        """Return the readings of the sensors and the torque that the computer sends, empty if they are not logged.
+        """Return the readings of the sensors and the torque that the computer sends, (time, ..), by name.
 
-        A sample without a reading of the attitude has NaN.
+        The result is empty if they are not logged. A sample without a reading of the attitude has NaN.
         """
         log, sensors = self.log, self.parts.sensors
         if log.readings is None or log.sent is None:

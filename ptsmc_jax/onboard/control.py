@@ -41,14 +41,17 @@ def _new_variables(translator: "Translator", variables: Sequence[Any]) -> list[n
 def _begin_loop(
     translator: "Translator", region: Region, init: Sequence[np.ndarray], variables: Any
 ) -> list[np.ndarray]:
-    """Return the C variables of a loop's state, with these components as initial values."""
+    """Return the C variables of a loop's state, as `_new_variables` does, with these components as initial values."""
     region.initial, state = _flatten(init), _new_variables(translator, variables)
     region.carried = _flatten(state)
     return state
 
 
 def _end_region(translator: "Translator", region: Region, variables: Sequence[Any]) -> list[np.ndarray]:
-    """Append a finished region to the current block. Return the C variables of its results."""
+    """Append a finished region to the current block.
+
+    Return the C variables of its results, as `_new_variables` does.
+    """
     results = _new_variables(translator, variables)
     region.results += _flatten(results)
     statement = Node("region", (), "", region, translator.pool.block)

@@ -99,7 +99,10 @@ def struct_fields(trees: Mapping[str, object], meanings: Mapping[str, str]) -> d
 
 
 def _names_and_meaning(path: tuple, tree: object) -> tuple[list[str], str]:
-    """Return the names of the attributes and entries that lead to a leaf, and its meaning from the source."""
+    """Return the names of the attributes and entries that lead to a leaf, the outermost first.
+
+    The second result is the meaning of the leaf in the source, empty if there is none.
+    """
     names, meaning, owner = [], "", tree
     for key in path:
         name = getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))

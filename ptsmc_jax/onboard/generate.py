@@ -95,7 +95,10 @@ def _add_derivation(code: Code, params: Parameters) -> None:
 
 
 def _fields_by_struct(board: Board) -> dict[str, Struct]:
-    """Return the fields of inputs, state and outputs, by the attribute of the board."""
+    """Return the fields of "inputs", "state" and "outputs", by these names.
+
+    The fields of a struct are lists by the name of its pytree, see `struct_fields`.
+    """
     return {name: struct_fields(getattr(board, name), board.meanings) for name in ("inputs", "state", "outputs")}
 
 

@@ -93,7 +93,7 @@ _MEANINGS = {
 
 
 def _plant_parts(parts: Parts) -> Values:
-    """Return the parts of `PARTS` by name."""
+    """Return the parts of `PARTS` by name, without those that the run lacks."""
     return {name: getattr(parts, name) for name in PARTS if getattr(parts, name) is not None}
 
 

@@ -128,7 +128,7 @@ class Translator:
             raise self.unsupported_error(eqn, frames) from None
 
     def _c_call(self, function: str, values: Sequence[np.ndarray], eqn: Any) -> list[np.ndarray]:
-        """Return the components of the results of a function that C has."""
+        """Return the components of each result of a function that C has, an object array in the shape of the result."""
         shape = eqn.outvars[0].aval.shape
         if function != "threefry":
             return [_map_entries(lambda *entry: self.pool.make(function, *entry), values, shape)]
@@ -137,7 +137,10 @@ class Translator:
                 for k in word_indices]  # fmt: skip
 
     def _translate_primitive(self, eqn: Any, values: list[np.ndarray]) -> np.ndarray:
-        """Return the components of the result of a primitive. Raises KeyError if it has no counterpart in C."""
+        """Return the components of the result of a primitive, an object array in the shape of the result.
+
+        Raises KeyError if the primitive has no counterpart in C.
+        """
         name, aval, pool = eqn.primitive.name, eqn.outvars[0].aval, self.pool
         kind = kind_of(aval.dtype)
 
@@ -239,7 +242,10 @@ class Translator:
     def _results_for_index(
         self, eqn: Any, values: Sequence[np.ndarray], arrays: Sequence[np.ndarray], index: Node | None, k: int
     ) -> np.ndarray:
-        """Return the results of a primitive with indices for the case that the computed index `index` is k."""
+        """Return the results of a primitive with indices for the case that the computed index `index` is k.
+
+        They are nodes in an object array of the shape of the result.
+        """
         if eqn.primitive.name in _INDEXED_ADDITIONS:
             array, indices, addends = values
             return self._add_at_indices(eqn, array, indices, addends, index, k)
@@ -280,7 +286,10 @@ class Translator:
 
 
 def _map_entries(rule: Callable, values: Sequence[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
-    """Return the components of an elementwise function, given the components of its arguments."""
+    """Return the components of an elementwise function, an object array of this shape.
+
+    The components of its arguments, `values`, are broadcast to the shape.
+    """
     return object_array(shape, map(rule, *(np.broadcast_to(value, shape).flat for value in values)))
 
 
@@ -293,5 +302,5 @@ def _fill_value(eqn: Any) -> float:
 
 
 def _constant_values(value: np.ndarray, index: Node | None = None, k: int = 0) -> np.ndarray:
-    """Return the numbers of an array of constant nodes. The node `index` counts as the constant k."""
+    """Return the numbers of an array of constant nodes, in its shape. The node `index` counts as the constant k."""
     return np.asarray([k if node is index else node.value for node in value.flat]).reshape(value.shape)

@@ -198,7 +198,7 @@ def _check_dispersion(scenario: Scenario) -> None:
 
 
 def _absent_needs(scenario: Scenario) -> dict[str, str]:
-    """Return the dispersions that this scenario cannot have, and what each of them needs."""
+    """Return the needed part in words for each dispersion that this scenario cannot have, by key."""
     devices = scenario.devices
     absent = {
         key: f"hardware.{key}, which is absent"

@@ -57,7 +57,7 @@ def warnings(scenario: Scenario, *, tuned: bool = False) -> list[str]:
 
 
 def _torque_limits(scenario: Scenario) -> Iterator[tuple[str, float, np.ndarray]]:
-    """Return key and value of each torque limit, and the axes (inputs, channels) of the torques that it limits."""
+    """Yield key and value of each torque limit, and the axes (inputs, channels) of the torques that it limits."""
     limit, wheels = scenario.devices.torque_limit, scenario.reaction_wheels
     if limit is not None:
         yield "hardware.torque_limit", limit, np.eye(scenario.inputs)
@@ -66,7 +66,7 @@ def _torque_limits(scenario: Scenario) -> Iterator[tuple[str, float, np.ndarray]
 
 
 def _limit_beyond_actuators(scenario: Scenario) -> Iterator[str]:
-    """Warn about a required torque that is larger than the torque limits of the actuators."""
+    """Yield a warning about a required torque that is larger than the torque limits of the actuators."""
     unit = " N m" if scenario.motion == "spacecraft" else ""
     for key, limit, axes in _torque_limits(scenario):
         about_axis = limit * float(np.max(np.sum(np.abs(axes), axis=1)))
@@ -83,7 +83,7 @@ def _limit_beyond_actuators(scenario: Scenario) -> Iterator[str]:
 
 
 def _disturbance_beyond_actuators(scenario: Scenario) -> Iterator[str]:
-    """Warn if constants and sinusoids that disturb a spacecraft exceed the torque limits of the actuators together.
+    """Yield a warning if constants and sinusoids that disturb a spacecraft exceed its torque limits together.
 
     Sinusoids from the Nyquist frequency on are not counted: vibration may be larger, and no actuator follows it.
     """
@@ -110,7 +110,7 @@ def _disturbance_beyond_actuators(scenario: Scenario) -> Iterator[str]:
 
 
 def _target_below_horizon(scenario: Scenario) -> Iterator[str]:
-    """Warn about a ground target that the Earth hides during the run."""
+    """Yield a warning about a ground target that the Earth hides during the run."""
     reference: Any = getattr(scenario, "reference", None)
     if hasattr(reference, "lowest_elevation"):
         elevation, t = reference.lowest_elevation(scenario)
@@ -122,7 +122,7 @@ def _target_below_horizon(scenario: Scenario) -> Iterator[str]:
 
 
 def _implausible_inertia(scenario: Scenario) -> Iterator[str]:
-    """Warn if the torque limits contradict the inertia: almost no slew, or a large turn in a control period.
+    """Yield a warning if the torque limits contradict the inertia: almost no slew, or a large turn in a control period.
 
     A turn by the angle a in the time t needs at least the acceleration 4 a / t^2: half of the time each to speed up
     and to slow down.
@@ -148,7 +148,7 @@ def _implausible_inertia(scenario: Scenario) -> Iterator[str]:
 
 
 def _delay_in_seconds(scenario: Scenario) -> Iterator[str]:
-    """Warn about a delay that was probably given in seconds: the key counts control periods."""
+    """Yield a warning about a delay that was probably given in seconds: the key counts control periods."""
     delay, period = scenario.devices.delay_periods, scenario.loop.period
     if delay * period >= MAX_DELAY_FRACTION * scenario.controller.t_f:
         yield (
@@ -158,7 +158,7 @@ def _delay_in_seconds(scenario: Scenario) -> Iterator[str]:
 
 
 def _lag_in_milliseconds(scenario: Scenario) -> Iterator[str]:
-    """Warn about a lag that is not short compared with t_f. It was probably given in milliseconds."""
+    """Yield a warning about a lag that is not short compared with t_f. It was probably given in milliseconds."""
     lag, t_f = scenario.devices.torque_lag or 0.0, scenario.controller.t_f
     if lag >= MAX_DELAY_FRACTION * t_f:
         yield (
@@ -168,7 +168,7 @@ def _lag_in_milliseconds(scenario: Scenario) -> Iterator[str]:
 
 
 def _unstable_surface_rate(scenario: Scenario) -> Iterator[str]:
-    """Warn if no K1 stabilises the sampled hold phase at the scenario's surface rate c.
+    """Yield a warning if no K1 stabilises the sampled hold phase at the scenario's surface rate c.
 
     The published c = 1 1/s assumes a control period that is short compared with 1 s.
     """
@@ -187,7 +187,7 @@ def _unstable_surface_rate(scenario: Scenario) -> Iterator[str]:
 
 
 def _implausible_noise(scenario: Scenario) -> Iterator[str]:
-    """Warn about a noisy star tracker whose gyro has no errors, or a noise that is larger than that of real devices."""
+    """Yield a warning about a noisy star tracker whose gyro has no errors, and about noise larger than in real devices."""
     device: Any = scenario.hardware
     noise = getattr(device, "attitude_noise", None) or 0.0
     gyro_keys = ("rate_noise", "rate_noise_density", "rate_bias", "rate_bias_walk")
@@ -217,7 +217,7 @@ def _implausible_noise(scenario: Scenario) -> Iterator[str]:
 
 
 def _implausible_bound(scenario: Scenario, bound: float, rate_bound: float) -> Iterator[str]:
-    """Warn about a stated bound that is more than `MAX_BOUND_RATIO` times too large or too small.
+    """Yield a warning about a stated bound that is more than `MAX_BOUND_RATIO` times too large or too small.
 
     Only the bound that the law uses is examined: K without an observer, c with an observer.
     """
@@ -236,7 +236,7 @@ def _implausible_bound(scenario: Scenario, bound: float, rate_bound: float) -> I
 
 
 def _noisy_estimate(scenario: Scenario, disturbance_bound: float, *, tuned: bool) -> Iterator[str]:
-    """Warn about an observer whose estimate has more noise than the disturbance has amplitude.
+    """Yield a warning about an observer whose estimate has more noise than the disturbance has amplitude.
 
     The default gain is as small as is useful, see `mission.design`, so only a larger gain causes the warning. A search
     has already tried smaller gains.

@@ -210,7 +210,15 @@ def _with_prescribed_time_law(setup: Parts) -> Parts:
 
 @programs.jit
 def _system_rates(setup: Parts, visited: tuple) -> tuple:
-    """Return Jacobians of a custom system at the visited states, and w' and w'' of the motion with zero error."""
+    """Return Jacobians of a custom system and the derivatives of its motion with zero error.
+
+    Args:
+        setup: the parts of the run.
+        visited: times (states,) and states (states, n), at which the Jacobians (states, n, n) are evaluated.
+
+    Returns:
+        The Jacobians, and a pair of w' and w'' of the motion with zero error, (times, m) each.
+    """
     plant, kinematics = typing.cast(System, setup.plant), setup.controller.kinematics
     zero = jnp.zeros(plant.inputs)
 
