@@ -118,7 +118,10 @@ def check_unchanged(programs: Mapping[str, str], results: Path, versions: Mappin
 
 
 def _known_checksums(versions: Mapping[str, object], key: str) -> list[str]:
-    """Return the known checksums of custom code. A comparison has one for each of its laws, under the same key."""
+    """Return the known checksums of custom code, a list without repetitions.
+
+    A comparison has a checksum for each of its laws, under the same key.
+    """
     laws = versions.get("custom_laws") if key == "controller.code" else None
     checksums = (versions.get(custom.checksum_name(key)), *(laws.values() if isinstance(laws, dict) else ()))
     return list(dict.fromkeys(map(str, filter(None, checksums))))
@@ -174,7 +177,7 @@ def _report_custom_code(programs: Mapping[str, str], source: Path) -> None:
 
 
 def _group_by_file(programs: Mapping[str, str]) -> dict[str, list[str]]:
-    """Return the keys that name each file, by its path."""
+    """Return the list of keys that name each file, by the path of the file."""
     files: dict[str, list[str]] = {}
     for key, where in programs.items():
         files.setdefault(location(key, where), []).append(key)

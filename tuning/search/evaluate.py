@@ -96,7 +96,7 @@ class Evaluator:
         return MeasurementWithGradients(**{name: np.concatenate([one[name] for one in known]) for name in known[0]})
 
     def _answer(self, problem: Problem, normalised: np.ndarray, *, with_gradients: bool) -> dict[str, np.ndarray]:
-        """Return the fields of a measurement by name, from the journal or from new simulations."""
+        """Return the fields of a measurement (points, ..), by name, from the journal or from new simulations."""
 
         def compute() -> dict[str, np.ndarray]:
             values = self._simulate_and_judge(problem, normalised, with_gradients)
@@ -108,7 +108,7 @@ class Evaluator:
     def _simulate_and_judge(
         self, problem: Problem, normalised: np.ndarray, with_gradients: bool
     ) -> dict[str, np.ndarray]:
-        """Return the fields of a measurement by name, without the rows of the margins."""
+        """Return the fields of a measurement (points, ..), by name, without the rows of the margins."""
         scaled = _apply_in_calls(partial(_gains_with_derivatives, scale=self.bounds.scale), normalised)
         gains, directions, metrics = scaled["gains"], scaled["along"], needed_metrics(problem)
         if with_gradients:
@@ -148,7 +148,11 @@ class Evaluator:
 
 
 def _apply_in_calls(program: Callable[..., dict[str, jax.Array]], *arrays: np.ndarray) -> dict[str, np.ndarray]:
-    """Apply a program for `POINTS_PER_CALL` points to arrays with any number of points on the first axis."""
+    """Apply a program for `POINTS_PER_CALL` points to arrays with any number of points on the first axis.
+
+    Returns:
+        The arrays of the program (points, ..), by name.
+    """
     count = len(arrays[0])
     padded = [np.resize(v, (-(-count // POINTS_PER_CALL) * POINTS_PER_CALL, *v.shape[1:])) for v in arrays]
     calls = [

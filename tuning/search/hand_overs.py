@@ -32,7 +32,14 @@ def _find_hand_over(problem: Problem, bounds: Bounds, normalised: np.ndarray) ->
 def _with_times(
     problem: Problem, bounds: Bounds, normalised: np.ndarray, times: list[tuple[str, float]]
 ) -> list[np.ndarray]:
-    """Return a point with each of these times [s] instead of its own, without the times outside their bounds."""
+    """Return a copy of a point (gains,) for each of these times, in a list without times outside their bounds.
+
+    Args:
+        problem: the tuning problem.
+        bounds: bounds of the free gains.
+        normalised: (gains,) normalised gains of the point.
+        times: pairs of a gain's name and its time [s], which replaces the time of the point.
+    """
     points = []
     for name, time in times:
         k = problem.names.index(name)

@@ -188,12 +188,15 @@ class LocalSearches:
         return self._explore_starts(problem, first)
 
     def _explore_starts(self, problem: Problem, first: np.ndarray, number: int = 0) -> dict[int, np.ndarray]:
-        """Return the results of the best short local searches, by number of the local search.
+        """Return the results of the best short local searches, by number of the local search, the best first.
 
         Args:
             problem: the tuning problem.
             first: (starts, gains) normalised gains of the starting points.
             number: number of the first local search.
+
+        Returns:
+            Normalised gains (gains,) of each of these searches.
         """
         first_steps, more_steps = max(2, self._steps // 4), max(2, self._steps // 2)
         contenders = dict(enumerate(first, number))
@@ -530,5 +533,5 @@ def _relaxed(problem: Problem) -> Sequence[int] | None:
 
 
 def _ranked(ends: Mapping[int, Best]) -> list[tuple[int, Best]]:
-    """Return the results of the local searches, the best first."""
+    """Return pairs of number and result of the local searches, in a list, the best first."""
     return sorted(ends.items(), key=lambda item: item[1].rank)

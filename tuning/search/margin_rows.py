@@ -82,7 +82,7 @@ def build_required_margins(ready: Study, bounds: Bounds, seed: int) -> RequiredM
 
 
 def _with_trials(asked: RequiredMargins, trials: np.ndarray) -> RequiredMargins:
-    """Return a copy with the loops of these trials."""
+    """Return the required margins for the loops of these trials (cases,), which replace the earlier ones."""
     coordinates = montecarlo.coordinates(asked.dispersion, asked.seed, jnp.asarray(trials, dtype=jnp.uint32))
     return replace(asked, coordinates=coordinates)
 

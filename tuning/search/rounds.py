@@ -148,7 +148,11 @@ class Rounds:
         return worst_case.screen(self.problem, self._on_every_trial, gains)
 
     def _count_violations(self, gains: np.ndarray) -> list[confirm.Count]:
-        """Count the trials beyond each limit on a fraction of the trials. Each call simulates other trials."""
+        """Count the trials beyond each limit on a fraction of the trials. Each call simulates other trials.
+
+        Returns:
+            A count for each of these limits, in the order of their rows in the problem.
+        """
         first = self.problem.averaged + worst_case.SCREENED
         counts = confirm.count_violations(
             self.problem, list(self._quantiles.values()), gains, first, self._confirmations
@@ -192,9 +196,13 @@ def _fill_slots(problem: Problem, slots: np.ndarray, joining: Joining) -> Proble
 
 
 def _with_bands(problem: Problem, bands: Mapping[int, np.ndarray]) -> Problem:
-    """Return the problem with limits that apply to bands of trials, by row, instead of to the averaged trials.
+    """Return the problem with limits that apply to bands of trials instead of to the averaged trials.
 
     The bands are in the last slots.
+
+    Args:
+        problem: the tuning problem.
+        bands: numbers of the trials of a band, by the row of the limit.
     """
     for turn, (row, band) in enumerate(bands.items(), start=1):
         slots = problem.trials.size - turn * BAND_SIZE + np.arange(band.size)
@@ -208,6 +216,9 @@ def _with_bands(problem: Problem, bands: Mapping[int, np.ndarray]) -> Problem:
 
 
 def _select_hardest(problem: Problem, trials: np.ndarray, ratio: np.ndarray) -> np.ndarray:
-    """Return the screened trials with the largest violation ratios that are not in the problem yet."""
+    """Return the numbers of the screened trials with the largest violation ratios that are not in the problem yet.
+
+    They are at most `HARDEST`, the worst first.
+    """
     known = set(np.asarray(problem.trials).tolist())
     return np.asarray([t for t in trials[np.argsort(-ratio)] if int(t) not in known][:HARDEST], dtype=np.uint32)

@@ -231,7 +231,12 @@ def _simulate_with_derivatives(
     metrics: tuple[str, ...],
     devices: int,
 ) -> tuple[jax.Array, jax.Array]:
-    """Return metrics, (devices, rows, trials, metrics + 1), with the status as the last one, and their derivatives."""
+    """Simulate rows with derivatives. Rows from index `needed_rows` on are zero.
+
+    Returns:
+        Metrics, (devices, rows, trials, metrics + 1), with the status as the last one, and their derivatives,
+        (devices, rows, trials, directions, metrics + 1).
+    """
 
     def simulate_trial(gains: jax.Array, trial: jax.Array, fixed: Coordinates, free: Coordinates) -> jax.Array:
         tuned_parts = with_gains(parts, dict(zip(names, gains, strict=True)))

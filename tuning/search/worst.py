@@ -166,7 +166,7 @@ def _to_variables(problem: Problem, name: str, c: np.ndarray) -> np.ndarray:
 
 
 def _variable_slices(coordinates: Coordinates, names: tuple[str, ...]) -> dict[str, slice]:
-    """Return the slice of the variables that belongs to each of these names."""
+    """Return the slice of the variables that belongs to each of these names, by name, in their order."""
     counts = [coordinates[name].shape[1] for name in names]
     ends = np.cumsum(counts, dtype=int).tolist()
     return {name: slice(end - count, end) for name, count, end in zip(names, counts, ends, strict=True)}
@@ -242,7 +242,10 @@ def ratio_with_gradient(
 
 
 def _coordinates_at(batch: Batch, y: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Return the coordinates of variables y, and for each moved name their derivatives, (cases, variables, numbers)."""
+    """Return the coordinates (cases, numbers) of variables y (cases, variables), by name of each dispersion.
+
+    The second result has their derivatives (cases, variables, numbers), by name of each moved dispersion.
+    """
     names = simulations.differentiable_dispersions(batch.dispersion)
     moved, shifts = jax.tree.map(np.asarray, _to_coordinates(batch.dispersion, dict(batch.coordinates), y, names))
     return {**batch.coordinates, **moved}, shifts

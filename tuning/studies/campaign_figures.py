@@ -76,7 +76,7 @@ def build(folder: Folder, summary: dict[str, Any]) -> dict[str, Figure]:
 
 
 def _strongest_inputs(summary: dict[str, Any], metrics: Sequence[str]) -> list[str]:
-    """Return the inputs that explain one of the metrics best, at most four; see `statistics.strongest_drivers`."""
+    """Return the names of at most four inputs that explain one of the metrics best, the best first."""
     explained = dict[str, float]()
     for metric in (name for name in metrics if name in summary["drivers"]):
         strongest = statistics.strongest_drivers(summary["drivers"][metric], summary["driver_trials"][metric])
@@ -121,7 +121,8 @@ def _plot_fan(
 ) -> dict[str, Figure]:
     """Simulate the first trials and the trial with the largest window error again, and plot their errors over time.
 
-    There is no figure if none of the first trials reaches its end, or if all errors are zero: its axis is logarithmic.
+    The result is the figure by its name. It is empty if none of the first trials reaches its end, or if all errors are
+    zero: its axis is logarithmic.
     """
     trials, window = frame["trial"].to_numpy(), frame["window_error"].to_numpy()  # a shard has only some of the trials
     first_trials = trials[:FAN_TRIALS]

@@ -161,7 +161,10 @@ def summarise(folder: Folder) -> dict[str, Any]:
 
 
 def _count_controller_samples(folder: Folder, parts: list[rows.Part]) -> dict[str, object]:
-    """Return the numbers of samples and of trials for each status of the C code; empty without C code."""
+    """Return the numbers of samples and of trials for each status of the C code, for `summary.json`.
+
+    The result is {"controller_samples": {status: {"samples": .., "trials": ..}}}, or {} without C code.
+    """
     if folder.controller is None:
         return {}
     columns = rows.column_names(parts[0])
@@ -193,7 +196,7 @@ def input_columns(folder: Folder, parts: list[rows.Part]) -> list[str]:
 
 
 def _equal_trials(quantiles: dict[str, Any], trials: int) -> list[str]:
-    """Return a warning if all trials have the same metrics."""
+    """Return a list with a warning if all trials have the same metrics, otherwise an empty list."""
     measured = [metric for metric in quantiles.values() if "max" in metric]
     differ = any(abs(m["max"] - m["mean"]) > TOLERANCE * abs(m["max"]) for m in measured)
     if trials < 2 or not measured or differ or any(m["without_value"] for m in measured):  # failed trials differ too
@@ -222,7 +225,8 @@ def _pointing_budget(folder: Folder, parts: list[rows.Part], finished: np.ndarra
     """Return the pointing budget: an upper bound for every pointing error index and axis [rad].
 
     At least a fraction of all possible runs stays below the bound, with a confidence, see `budget_statistics`. A bound
-    is None if there are too few trials, or too many of them failed.
+    is None if there are too few trials, or too many of them failed. The result is {"pointing": {.., "budget":
+    {index: {axis: bound}}}}, or {} without [pointing].
     """
     table = getattr(folder.scenario, "pointing", None)
     if table is None:

@@ -316,7 +316,10 @@ def contender_results(contender: Contender) -> dict[str, object]:
 
 
 def _perturbed_results(trials: Trials) -> dict[str, object]:
-    """Return the results of trials with a model error that the law does not know."""
+    """Return the results of trials with a model error that the law does not know, by name.
+
+    They are the window error with its interval, the largest peak torque, and the number of failures.
+    """
     error, interval = judging.rms_window_error(trials)
     return {
         "window_error": error,
@@ -382,7 +385,10 @@ def warn_about_plain_numbers(scenario: Scenario) -> Iterator[str]:
 
 
 def _warnings_by_law(results: Mapping[str, Contender]) -> list[str]:
-    """Return the warnings of all laws. A warning names its laws if it does not concern all of them."""
+    """Return the warnings of all laws in a list, each text once.
+
+    A warning begins with its laws if it does not concern all of them.
+    """
     laws_by_text: dict[str, list[str]] = {}
     for law, contender in results.items():
         texts = plausibility.warnings(contender.simulated, tuned=law != PUBLISHED)

@@ -355,7 +355,10 @@ def describe_equal_stability(simulated: Map) -> str:
 
 
 def _radii(scenario: Scenario) -> dict[str, str]:
-    """Return the fields of the spectral radius that decide the stability of a pair, and their phases in words."""
+    """Return the fields of a cell with the spectral radii that decide the stability of a pair, a dict.
+
+    Its values are the phases of these radii in words.
+    """
     phases = {"radius": "at the hand-over"} if scenario.controller.law.prescribed else {}
     return phases | {"hold_radius": "in the hold phase"}
 

@@ -130,7 +130,8 @@ def summary(tuning: Tuning) -> dict[str, object]:
 def _accuracy_gain(held_out: Mapping[str, Trials]) -> dict[str, object]:
     """Return the ratio of the published gains' RMS window error to the tuned gains' error, and its interval.
 
-    The ratio is over the trials that reach their end with both sets of gains.
+    The ratio is over the trials that reach their end with both sets of gains. The result has the keys of
+    `summary.json`, with None if there are no such trials.
     """
     both = held_out["tuned"].finished & held_out["published"].finished if "published" in held_out else np.zeros(0, bool)
     if not both.any():

@@ -202,6 +202,9 @@ def _search_and_judge(
     """Search for gains, in wider bounds if gains end on default bounds, and judge them on held-out trials.
 
     If the gains break a limit there that the search kept, search again with more distance from the limits.
+
+    Returns:
+        The judged gains, and the tuning problem with the bounds of the last search.
     """
     # A repeated search uses all starting points: gains with more distance from the limits may be far from these gains.
     starts = scenario.search.starts
@@ -239,6 +242,9 @@ def _search_in_wider_bounds(
 
     `_relevant_bounds` selects these gains. The bounds of several gains may be widened at the same time. A search
     without improvement ends the repetition.
+
+    Returns:
+        The best result with the history of all searches, and its tuning problem.
     """
     default_bounds = setup.ready.scenario.defaulted
     for k in range(MOST_WIDENINGS):
@@ -266,7 +272,7 @@ def _search_in_wider_bounds(
 
 
 def _relevant_bounds(setup: TuningSetup, outcome: Search, sides: dict[str, str]) -> dict[str, str]:
-    """Return those gains on a bound whose change affects the result.
+    """Return those gains on a bound whose change affects the result: "lower" or "upper", by name.
 
     The change moves the gain inwards by a tenth of its interval. It must change F or the violation by more than 0.01.
     """
@@ -292,7 +298,7 @@ def _find_shortest_time(setup: TuningSetup, judged: _Judged) -> ShortestTime | N
 def _find_broken_requirements(
     candidates: dict[str, Scenario], held_out: dict[str, Trials], seed: int, problem: Problem
 ) -> dict[str, list[str]]:
-    """Return the gains that are more accurate than the tuned gains, and the metrics whose requirements they break.
+    """Return the metrics whose requirements other gains break, if these gains are more accurate than the tuned gains.
 
     Accuracy is compared over the trials that reach their end with both sets of gains.
 
@@ -301,6 +307,9 @@ def _find_broken_requirements(
         held_out: held-out trials of each set of gains, by the same names; "tuned" are the tuned gains.
         seed: seed of these trials.
         problem: the tuning problem of the search.
+
+    Returns:
+        A list of metrics for each more accurate set of gains, by its name. The list is empty if they meet everything.
     """
 
     def more_accurate(trials: Trials) -> bool:
@@ -336,7 +345,7 @@ def _check_result(setup: TuningSetup, judged: _Judged) -> Trust:
 
 
 def _broken_ratios(outcome: Search, verdicts: list[Verdict]) -> dict[str, float]:
-    """Return value over limit for each metric that breaks its limit on the held-out trials.
+    """Return value over limit for each metric that breaks its limit on the held-out trials, by metric.
 
     The result is empty if a search with more distance from the limits cannot help. It can help if the search kept every
     limit, if each broken limit had an effect in the search, and if every value is finite.
@@ -360,12 +369,13 @@ def _renumber_starts(history: list[Step], repeated: list[Step]) -> list[Step]:
 def _results_beyond_bounds(judged: _Judged, at_bound: dict[str, str]) -> dict[str, BeyondBound]:
     """Simulate each gain that ended on a bound at a value beyond the bound, with the other gains unchanged.
 
-    The result is empty for the continuous loop, and if the objective is not the window error. Gains without a valid
-    value beyond their bound are left out.
-
     Args:
         judged: the tuned gains.
         at_bound: "lower" or "upper" for each gain on a bound, by its name.
+
+    Returns:
+        The results by the name of the gain, without gains that have no valid value beyond their bound. There are none
+        for the continuous loop, and if the objective is not the window error.
     """
     beyond, tuned = dict[str, BeyondBound](), judged.tuned
     if not tuned.sampled or tuned.search.minimise != "window_error":
