@@ -318,6 +318,7 @@ class ChainKinematics(Kinematics):
         return jnp.abs(x[0])
 
     def influence(self, x: State, target: PyTree) -> Scalar:
+        """Return 1: d is a term of the n-th derivative of x_1."""
         return jnp.ones(())
 
     def invert(self, x: State, target: PyTree, acceleration: Vector, d_hat: Vector) -> Vector:

@@ -115,6 +115,7 @@ class TimeBasePD(TimeBase):
     switches: ClassVar[bool] = False
 
     def feedback(self, deviation: Vector, rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
+        """Return -k_d E' - k_p E, and the sliding variable E' + k_p / k_d E, (m,) each."""
         return -self.k_d * rate - self.k_p * deviation, rate + self.k_p / self.k_d * deviation
 
     @staticmethod
@@ -138,6 +139,7 @@ class TimeBaseSliding(TimeBase):
     sign_width: Leaf = boundary_layer(Scaled(1e-3, time=-1), "1/s")
 
     def feedback(self, deviation: Vector, rate: Vector, bound: Scalar) -> tuple[Vector, Vector]:
+        """Return -c E' - k s - K sign(s), and the sliding variable s = E' + c E, (m,) each."""
         s = rate + self.surface_rate * deviation
         return -self.surface_rate * rate - self.k * s - bound * guards.smooth_sign(s, self.sign_width), s
 

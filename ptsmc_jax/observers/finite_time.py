@@ -88,6 +88,7 @@ class FiniteTimeObserver(Observer):
         return jnp.zeros((size, size))
 
     def forcing(self, t: Scalar, span: tuple[Scalar, Scalar], memory: Memory, d_eff: Vector) -> Memory:
+        """Return the derivatives of d_hat and of the second state, (2 m,), by the equations of the class."""
         d_hat, e0 = jnp.split(memory, 2)
         root = 1.5 * jnp.sqrt(self.gain) * guards.signed_root(e0, self.sign_width)
         return jnp.concatenate([-1.1 * self.gain * guards.smooth_sign(e0, self.sign_width), d_hat - d_eff - root])

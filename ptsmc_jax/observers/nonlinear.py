@@ -50,6 +50,7 @@ class NonlinearObserver(Observer):
         return self.gain[:, None] * self.model.inertia_inverse
 
     def forcing(self, t: Scalar, span: tuple[Scalar, Scalar], memory: Memory, d_eff: Vector) -> Memory:
+        """Return l J^-1 d_eff, (m,)."""
         return self.gain * (self.model.inertia_inverse @ d_eff)
 
     def update_matrix(self, dt: Scalar) -> Matrix:

@@ -187,7 +187,7 @@ def _unstable_surface_rate(scenario: Scenario) -> Iterator[str]:
 
 
 def _implausible_noise(scenario: Scenario) -> Iterator[str]:
-    """Yield a warning about a noisy star tracker whose gyro has no errors, and about noise larger than in real devices."""
+    """Yield a warning about a noisy star tracker with a perfect gyro, or about noise larger than in real devices."""
     device: Any = scenario.hardware
     noise = getattr(device, "attitude_noise", None) or 0.0
     gyro_keys = ("rate_noise", "rate_noise_density", "rate_bias", "rate_bias_walk")

@@ -112,6 +112,7 @@ class SlewTable(AttitudeReference, frozen=True):
         return short * (1.0 - 2.0 * np.pi / angle) if self.way == "long" and angle > 0.0 else short
 
     def check(self, scenario: "SpacecraftScenario") -> None:
+        """Raise ScenarioError if the attitude at the start or at the end is not valid."""
         super().check(scenario)
         attitude_keys.unit_quaternion("reference.to_quat_xyzw", self.to_quat_xyzw)
 
@@ -150,6 +151,7 @@ class FileReference(ReferenceTable, frozen=True):
         return {"reference.file": self._samples(scenario).fastest}
 
     def check(self, scenario: "SpacecraftScenario") -> None:
+        """Raise ScenarioError if the samples of the file do not cover the run."""
         samples = self._samples(scenario)
         first, last = samples.times[0], samples.usable_until
         if first > 0.0 or last < 0.0:
@@ -170,6 +172,7 @@ class FileReference(ReferenceTable, frozen=True):
         return references.interpolate_attitude(samples.times, samples.quaternions, samples.end_rates)
 
     def initial_reference_attitude(self, scenario: "SpacecraftScenario") -> np.ndarray:
+        """Return the quaternion (4,) of the sample that is nearest to t = 0."""
         self.check(scenario)
         samples = self._samples(scenario)
         k = int(np.argmin(np.abs(samples.times)))  # the nearest sample is accurate enough for a default
@@ -259,6 +262,7 @@ class MissionTable(ReferenceTable, frozen=True):
         return orbits.mounting(self.primary_axis, self.secondary_axis)
 
     def check(self, scenario: "SpacecraftScenario") -> None:
+        """Raise ScenarioError if body axes are zero or parallel, or if the directions are not known."""
         _check_axis("reference.primary_axis", self.primary_axis)
         _check_axis("reference.secondary_axis", self.secondary_axis, self.primary_axis)
         self.initial_frame(scenario)
@@ -289,12 +293,14 @@ class NadirTable(MissionTable, frozen=True):
 
     @property
     def mount(self) -> np.ndarray:
+        """Quaternion (4,) from body axes to orbit axes."""
         return orbits.nadir_mounting(self.primary_axis, self.secondary_axis)
 
     def build(self, scenario: "SpacecraftScenario") -> references.Reference:
         return jax.tree.map(vector, self.part_class(q=IDENTITY, mount=self.mount, orbit=self._orbit(scenario)))
 
     def initial_frame(self, scenario: "SpacecraftScenario") -> np.ndarray:
+        """Return the matrix (3, 3) from orbit axes (radial, along-track, normal) to inertial axes at t = 0."""
         place = self._orbit(scenario)(np.zeros(()), np)
         return np.stack([place.radial, place.along, place.normal], axis=1)
 
@@ -394,6 +400,7 @@ class GroundTargetTable(DirectionsTable, frozen=True):
     secondary: Annotated[Vector, SECONDARY] = "velocity"
 
     def check(self, scenario: "SpacecraftScenario") -> None:
+        """Raise ScenarioError if the latitude or an axis is not allowed, or if there is no orbit."""
         if abs(self.latitude) > LARGEST_LATITUDE:
             raise wrong("reference.latitude", self.latitude, 'from -pi/2 to pi/2 [rad], or with its unit, as "48 deg"')
         super().check(scenario)
@@ -410,6 +417,7 @@ class GroundTargetTable(DirectionsTable, frozen=True):
         return float(np.arcsin(sines.min())), float(times[np.argmin(sines)])
 
     def directions(self, mission: Mission) -> tuple[orbits.Direction, orbits.Direction]:
+        """Return the direction to the ground target, and the secondary direction."""
         point = orbits.ground_point(self.latitude, self.longitude, self.height)
         return orbits.GroundPoint(point), mission.direction("reference.secondary", self.secondary)
 
@@ -423,6 +431,7 @@ class TwoVectorTable(DirectionsTable, frozen=True):
     secondary: Annotated[Vector, SECONDARY] = (0.0, 0.0, 1.0)
 
     def directions(self, mission: Mission) -> tuple[orbits.Direction, orbits.Direction]:
+        """Return the directions of the keys `primary` and `secondary`."""
         primary = mission.direction("reference.primary", self.primary)
         return primary, mission.direction("reference.secondary", self.secondary)
 

@@ -110,6 +110,7 @@ class Sinusoid(Disturbance):
     drawn: ClassVar[Mapping[str, str]] = {"phase": "phase", "amplitude": "amplitude"}
 
     def __call__(self, t: Scalar, x: State = None) -> Float[Array, " m"]:
+        """Return bias + amplitude sin(frequency t + phase) at t [s], (m,) in the unit of d."""
         sine, _ = _sin_cos_of_sum(self.frequency * t, self.phase)
         return self.bias + self.amplitude * sine
 

@@ -139,6 +139,7 @@ class Swing(Reference):
         return turning + float(np.max(np.abs(self.frequency)))
 
     def attitude(self, t: Scalar) -> Float[Array, "4"]:
+        """Return the quaternion (4,) of the rotation vector amplitude sin(frequency t + phase)."""
         return attitude.from_rotation_vector(self.amplitude * jnp.sin(self.frequency * t + self.phase))
 
 
@@ -162,6 +163,7 @@ class Slew(Reference):
         return (turning + 2.0 * np.pi) / float(self.duration)
 
     def attitude(self, t: Scalar) -> Float[Array, "4"]:
+        """Return the quaternion (4,) of a fraction of the turn. The fraction is 1 from `duration` on."""
         x = jnp.clip(t / self.duration, 0.0, 1.0)
         fraction = x * x * x * (10.0 + x * (6.0 * x - 15.0))
         return attitude.from_rotation_vector(fraction * self.turn)
