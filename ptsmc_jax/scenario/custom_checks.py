@@ -220,7 +220,7 @@ def _check_observer(parts: Parts, call: _Checker) -> None:
 
 
 def _check_law(parts: Parts, call: _Checker) -> None:
-    """Check `begin` and `acceleration` of a custom law, or its `__call__` if it has one."""
+    """Check `begin` and `acceleration` of a custom law, or its own `__call__` instead of `acceleration`."""
     law: Any = parts.controller
     zero, u = jnp.zeros_like(parts.t_end), jnp.zeros(parts.plant.inputs)
     target = parts.reference(zero)

@@ -529,7 +529,7 @@ def as_written(error: ScenarioError, raw: Mapping[str, Any]) -> ScenarioError:
 
 
 def _find_non_finite(value: object) -> float | int | None:
-    """Return the first number in nested tables and lists that no finite float can hold, or None."""
+    """Return the first number in nested tables and lists that is not finite, or too large for a float; else None."""
     if isinstance(value, float) and not math.isfinite(value):
         return value
     if isinstance(value, int) and value.bit_length() > MOST_BITS:
