@@ -121,14 +121,20 @@ def untuned(text: str) -> dict[str, Any]:
 
 
 def roomy(timing: Any) -> Any:
-    """Return the clock with more steps, or periods of length zero, so that different runs share a compiled program."""
+    """Return the clock with more steps, or more periods of length zero.
+
+    Different runs then share a compiled program. timing: a sampled or graded clock.
+    """
     counts = {name: getattr(timing, name) for name in (("count",) if timing.sampled else ("before", "after"))}
     more = {name: count if count > 1024 else 512 if count <= 512 else 1024 for name, count in counts.items()}
     return dataclasses.replace(timing, **more)
 
 
 def fly(run: Parts, seed: int = 0, trial: int = 0) -> Any:
-    """Simulate a run with its history as NumPy arrays. One program serves all parts with the same structure."""
+    """Simulate a run and return the `rollout` result with its history, all as NumPy arrays.
+
+    One program serves all parts with the same structure.
+    """
     numbers = jax.tree.map(np.asarray, run)  # without the weak types of Python numbers
     simulated = rollout.simulate_parts(
         numbers, np.uint32(seed), np.uint32(trial), record=True, software=rollout.PYTHON_SOFTWARE
@@ -152,7 +158,7 @@ def vector(*values: Any) -> Any:
 
 
 def time_derivative(signal: Any) -> Any:
-    """Return the time derivative of a signal as a function of time [1/s], by automatic differentiation."""
+    """Return the time derivative of a signal as a function of time [s], by automatic differentiation; signal: of t."""
     return lambda t: jax.jvp(signal, (t,), (jnp.ones_like(t),))[1]
 
 
@@ -183,7 +189,12 @@ def parts(
     saves: Any = (),
     kinematics: Any = AdditiveKinematics,
 ) -> Parts:
-    """Return the parts of the published Case I with changes, in the continuous loop unless a period is given."""
+    """Return the parts of the published Case I with changes, in the continuous loop unless a period is given.
+
+    gain: of the observer. q, rate: initial attitude and body rate [rad/s]. rate_bound: of the disturbance. noise: 1
+    sigma of attitude [rad] and rate [rad/s]. flight: whether a sampled loop uses the flight clock. saves: extra times
+    in the history.
+    """
     body = rigid_body.spacecraft(inertia)
     t_end = t_f + 10.0 if t_end is None else t_end
     if period is None:
@@ -213,7 +224,10 @@ def parts(
 
 
 def commanded(law: Any, t: Any, hold: Any, x: Any, target: Any, d_hat: Any, k2: Any) -> Any:
-    """Return input and sliding variable of a law without a memory at t [s]."""
+    """Return input u (m,) and sliding variable s of a law without a memory at t [s].
+
+    hold: whether t is in the hold phase. k2: bound on the error of d_hat.
+    """
     u, s, _ = law(Sample(t, hold, vector(0.1)), x, target, d_hat, k2)
     return u, s
 
@@ -237,9 +251,10 @@ def chain_parts(
     f: Any = None,
     g: Any = None,
 ) -> Parts:
-    """Return the parts of an integrator chain with the length of x0, without disturbance.
+    """Return the parts of an integrator chain with the length of x0, by default without disturbance.
 
-    `steps` are the numbers of steps before and after the hand-over time t_s, for another grid than the default.
+    The loop is continuous unless a period [s] is given. `bound` is K2 without an observer. `noise` is 1 sigma of each
+    state. `steps` are the numbers of steps before and after the hand-over time t_s, for another grid than the default.
     """
     n, t_end = len(x0), t_f + 2.0
     model = integrator_chain.chain(n, f, g)
@@ -271,13 +286,13 @@ def chain_parts(
 
 
 def chain_flight() -> Parts:
-    """Return a chain with noise on the flight clock. Its t_f and t_end lie between samples."""
+    """Return the parts of a chain with noise on the flight clock. Its t_f and t_end lie between samples."""
     run = chain_parts([1.0, 0.2], 5.02, delta=0.53, period=0.05, noise=[2e-4, 1e-4])
     return dataclasses.replace(run, clock=clock.flight_clock(0.05, 7.02))
 
 
 def with_controller(run: Parts, **changes: Any) -> Parts:
-    """Return the parts with other values in the controller."""
+    """Return the parts with other values of fields of the controller."""
     return dataclasses.replace(run, controller=dataclasses.replace(run.controller, **changes))
 
 
@@ -292,25 +307,31 @@ def finer(run: Parts, times: int) -> Parts:
 
 
 def short(cases: Any, kept: Any) -> list[Any]:
-    """Return cases for `parametrize`. All cases except those in `kept` are marked `long`."""
+    """Return cases for `parametrize`. All cases except those in `kept` are marked `long`.
+
+    A case is a value, or a tuple of the values of one case.
+    """
     many = [case if isinstance(case, tuple) else (case,) for case in cases]
     return [case if case in kept else pytest.param(*one, marks=pytest.mark.long)
             for case, one in zip(cases, many, strict=True)]  # fmt: skip
 
 
 def drawn(check: Any, count: int, **cases: Any) -> Any:
-    """Return a test that calls `check` for `count` random cases, which are the same in every run."""
+    """Return a test that calls `check` for `count` random cases, which are the same in every run.
+
+    cases: the Hypothesis strategy of each argument of `check`.
+    """
     return settings(max_examples=count, deadline=None, derandomize=True, database=None)(given(**cases)(check))
 
 
 def tree(folder):
-    """Return the contents of the files of a folder, by path."""
+    """Return {path relative to the folder: content in bytes} for all files of a folder."""
     return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 @contextlib.contextmanager
 def refuses(error, said):
-    """Assert that the code raises this error with one sentence, which contains the words."""
+    """Assert that the code raises this error with one sentence, which contains the text `said`."""
     with pytest.raises(error) as caught:
         yield caught
     assert said in str(caught.value)
@@ -318,12 +339,15 @@ def refuses(error, said):
 
 
 def rows_of(folder):
-    """Return the rows of all trials in the folder of a campaign."""
+    """Return a data frame with the rows of all trials in the result folder of a campaign."""
     return pl.concat([pl.read_parquet(path) for path in sorted((folder / "trials").glob("*.parquet"))])
 
 
 def refused(command, tmp_path, *args):
-    """Run a command that must fail; return its one-sentence error after checking that it wrote no files."""
+    """Run a command that must fail; return its one-sentence error after checking that it wrote no files.
+
+    command: the fixture. args: of `ptsmc`.
+    """
     before = tree(tmp_path)
     status, out, err = command(*args)
     assert (status, out) == (2, "")
@@ -368,7 +392,10 @@ class _CalledError(Exception):
 
 
 def assert_prepared(monkeypatch, owner, program, prepare, call):
-    """Assert that `prepare` and `call` pass arguments of equal structure, types and static values to a program."""
+    """Assert that `prepare` and `call` pass arguments of equal structure, types and static values to a program.
+
+    owner, program: module and name of the program, which is replaced. prepare, call: functions without arguments.
+    """
     calls = []
 
     def heard(*given, **fixed):
@@ -390,7 +417,7 @@ def assert_prepared(monkeypatch, owner, program, prepare, call):
 
 
 def equations(trace: Any) -> Any:
-    """Return all equations of a jaxpr, those of nested jaxprs included."""
+    """Yield all equations of a jaxpr or trace, those of nested jaxprs included."""
     for eqn in getattr(trace, "jaxpr", trace).eqns:
         yield eqn
         for value in eqn.params.values():

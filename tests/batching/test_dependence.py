@@ -10,17 +10,23 @@ TEST, ONE, OTHER = 1, 2, 4  # one bit for each of the three inputs
 
 
 def chosen(test, one, other):
-    """Return outputs of a branch. Both depend on the test, which selects the branch."""
+    """Return (one, other) if test > 0, else (other, -other), by `cond`.
+
+    Both outputs depend on `test` and `other`, and only the first depends on `one`.
+    """
     return jax.lax.cond(test > 0.0, lambda: (one, other), lambda: (other, -other))
 
 
 def jitted(test, one, other):
-    """Return outputs of a jitted function. They do not depend on the test."""
+    """Return one + other and 2 other from a jitted function. They do not depend on `test`."""
     return jax.jit(lambda a, b: (a + b, 2.0 * b))(one, other)
 
 
 def shifted(test, one, other):
-    """Return outputs of a scan. The first carry depends on the second, which depends on the rows of a step earlier."""
+    """Scan twice over the test; return both last carries, and the first carry before each step (2,).
+
+    The first carry depends on the second, which is the row of the previous step.
+    """
 
     def step(carry, row):
         a, b = carry
@@ -31,7 +37,10 @@ def shifted(test, one, other):
 
 
 def repeated(test, one, other):
-    """Return outputs of a while loop. All depend on the test, which determines the number of steps."""
+    """Add 1 to `one` and double `other` while one < test; return both.
+
+    Both depend on the test, which determines the number of steps.
+    """
     return jax.lax.while_loop(
         lambda carry: carry[0] < test, lambda carry: (carry[0] + 1.0, 2.0 * carry[1]), (one, other)
     )

@@ -47,13 +47,13 @@ CONTINUOUS = {
 
 
 def metrics_of_trial(tables):
-    """Return a function from a trial number to the result of its simulation."""
+    """Return a function from a trial number to the `Simulated` of that trial; tables: of the scenario."""
     ready = scenario.study(scenario.from_tables(tables))
     return lambda trial: montecarlo.one(ready.parts, ready.dispersion, jnp.uint32(SEED), trial)
 
 
 def metrics_and_derivatives(tables):
-    """Return a function from a trial to its metrics and their derivatives by eta."""
+    """Return a function from a trial number to (metrics, their derivatives by eta); tables: of the scenario."""
     ready = scenario.study(scenario.from_tables(tables))
 
     def metrics(eta, trial):
@@ -76,7 +76,7 @@ def small_blocks(monkeypatch):
 
 @pytest.fixture
 def kernels(monkeypatch):
-    """Return a list, which receives the length of each loop that runs as a kernel."""
+    """Return a list, which receives the number of steps of each loop that runs as a kernel."""
     lengths, scan = [], kernel.scan
 
     def recorded(params, *rest):
@@ -89,13 +89,19 @@ def kernels(monkeypatch):
 
 
 def with_and_without_kernel(function, options=None):
-    """Return the results of a kernel and of a scan."""
+    """Return a list of two results for the trials `NUMBERS`: of a kernel and of a scan.
+
+    function: of a trial number. options: of the compiler.
+    """
     mapped = lanes.vmap(function, kernel=True), lanes.vmap(function)
     return [jax.jit(one, compiler_options=options)(NUMBERS) for one in mapped]
 
 
 def check_kernel(function, tolerance, options=None):
-    """Check that kernel and scan agree within a tolerance relative to the largest value of each result."""
+    """Check that kernel and scan agree within a tolerance relative to the largest value of each result.
+
+    The arguments `function` and `options` are those of `with_and_without_kernel`.
+    """
     got, expected = with_and_without_kernel(function, options)
     checked = 0
     for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
@@ -157,7 +163,10 @@ def test_kernel_equals_scan_in_single_precision():
 
 
 def lower_for_cuda(function, arguments, monkeypatch):
-    """Return the trace of a batch with kernels, and its text after lowering for CUDA."""
+    """Return the trace of a batch with kernels, and its text after lowering for CUDA.
+
+    function: of one trial. arguments: of all trials, along the first axis.
+    """
     monkeypatch.setattr(configure, "devices", gpus)
     monkeypatch.setattr(kernel, "BLOCK", 128)
     with abstract_gpu():
@@ -195,7 +204,7 @@ def test_trials_simulated_with_a_kernel_equal_trials_without():
 
 
 def extremes(c, n):
-    """Return maxima, minima and clipped values of booleans and of numbers that may be NaN."""
+    """Return maxima, minima and clipped values (7,) of booleans and of numbers that may be NaN; c, n: scalars."""
     wild, none = jnp.stack([c, 1.0 / (n - 3.0) * 0.0, 0.5 * c]), jnp.where(c > -9.0, jnp.nan, c)
     pairs = jnp.maximum(wild[1], c) + jnp.minimum(none, c), jnp.clip(wild[1], -1.0, 1.0) + jnp.max(wild)
     folds = jnp.min(wild), jax.lax.cummax(wild)[2], jax.lax.cummin(wild, reverse=True)[0], jax.lax.clamp(0.0, c, 9.0)
@@ -266,19 +275,22 @@ def test_kernel_supports_nested_loops_branches_and_shared_values(kernels):
 
 
 def check_equal(got, expected):
-    """Assert that shapes and dtypes are equal, and numbers are equal to a relative 1e-14."""
+    """Assert that two pytrees have equal shapes and dtypes, and numbers equal to a relative 1e-14."""
     for (path, a), b in zip(jax.tree.leaves_with_path(got), jax.tree.leaves(expected), strict=True):
         assert (a.shape, a.dtype) == (b.shape, b.dtype)
         np.testing.assert_allclose(a, b, rtol=1e-14, err_msg=jax.tree_util.keystr(path))
 
 
 def loop(step, length=9):
-    """Return a function of a trial that runs a loop of this step."""
+    """Return a function of a trial number n: the last carry of `length` calls of step(carry, n), which start at n."""
     return lambda n: jax.lax.scan(lambda c, k: (step(c, n), None), n.astype(float), None, length)[0]
 
 
 def loops_with_carries(*values):
-    """Return a function with loops that carry one of the values and a number; the value differs by trial or not."""
+    """Return a function of a trial number that returns the last carries (value, number) of two loops for each value.
+
+    The first loop keeps the value. The second loop adds the trial number to it in each step.
+    """
 
     def function(n):
         def run(value, by_trial):

@@ -20,17 +20,20 @@ einsum, tensordot, dot_general = jnp.einsum, jnp.tensordot, lax.dot_general
 
 
 def draw(*shape, low=-2.0, high=2.0, seed=0, trials=TRIALS):
-    """Return different random numbers (trials, *shape), so that exchanged components are detected."""
+    """Return random numbers from `low` to `high`, (trials, *shape).
+
+    All numbers differ, so that exchanged components are detected.
+    """
     return jnp.asarray(np.random.default_rng([seed, *shape]).uniform(low, high, (trials, *shape)))
 
 
 def integers(*shape, low=-9, high=10, dtype: Any = jnp.int64, seed=0):
-    """Return random integers (TRIALS, *shape)."""
+    """Return random integers (TRIALS, *shape) from `low` to `high` - 1."""
     return jnp.asarray(np.random.default_rng([seed, *shape]).integers(low, high, (TRIALS, *shape)), dtype)
 
 
 def agree(got, expected):
-    """Check that structure, shapes and dtypes are equal, and numbers are equal up to rounding errors.
+    """Check that structure, shapes and dtypes of two pytrees are equal, and numbers are equal up to rounding errors.
 
     The tolerance is 1e-14 of the largest number of an array. Sums in another order, multiply-adds and vectorised
     functions differ by a few eps. NaN and infinities must be at the same places.
@@ -60,7 +63,7 @@ def in_loop(function):
 
 
 def check(function, *args, in_axes: Any = 0):
-    """Assert that `lanes.vmap` and `jax.vmap` of a function have equal results."""
+    """Assert that `lanes.vmap` and `jax.vmap` of a function have equal results; in_axes: as for `jax.vmap`."""
     mapped = lanes.vmap(function, in_axes), jax.vmap(function, in_axes)
     agree(*jax.jit(lambda *args: [one(*args) for one in mapped])(*args))  # one program compiles faster than two
 
@@ -196,12 +199,18 @@ CONTRACTIONS: dict[str, tuple] = {
 
 
 def rotating(x, m, length=7, **options):
-    """Multiply a vector by a matrix in each step of a scan; return the last vector and rows of all steps."""
+    """Multiply a vector by a matrix in each step of a scan; return the last vector and the outputs of all steps.
+
+    The outputs are the vector, its first component and the number of the step.
+    """
     return scan(lambda x, k: (jnp.tanh(m @ x) + 0.1 * k, (x, x[0], k)), x, jnp.arange(length), **options)
 
 
 def scans_of_rows(x, rows):
-    """Scan over the rows of a table, with a number and a counter as carry."""
+    """Scan over the rows of a table {"a", "b"}; return the last carry and a dict of the outputs of all rows.
+
+    The carry is x and a counter, which starts at 0.
+    """
 
     def step(carry, row):
         total, count = carry
@@ -215,7 +224,7 @@ def scans_of_rows(x, rows):
 
 
 def nested(x, m):
-    """Run a scan in each step of a scan."""
+    """Run a scan in each step of a scan; return the last vector and one number of each of the four steps."""
 
     def outer(x, k):
         inner, ys = scan(lambda y, j: (y + 0.1 * jnp.cos(x) * j, y @ x), x, jnp.arange(3))
@@ -225,13 +234,19 @@ def nested(x, m):
 
 
 def late(s):
-    """Scan with carries that depend on each other in a chain. The last one depends on the trial from step 4 on."""
+    """Scan with carries that depend on each other in a chain; return the last carries and the carries before each step.
+
+    The last carry depends on the trial from step 4 on.
+    """
     one = jnp.ones(())
     return scan(lambda c, k: ((s, c[0], c[1] * 2, c[2] + k, c[4] + 1), c), (one, one, one, one, 0), jnp.arange(8))
 
 
 def time_and_state(s):
-    """Scan with a time, which does not depend on the trial, and a state, which does."""
+    """Scan with a time, which does not depend on the trial, and a state, which does.
+
+    Return the last time and state, and both before each step.
+    """
 
     def step(carry, _):
         t, x = carry
@@ -241,38 +256,47 @@ def time_and_state(s):
 
 
 def late_in_call(x):
-    """Scan with a dependence on the trial that passes through a jitted function and a checkpoint."""
+    """Scan with a dependence on the trial that passes through a jitted function and a checkpoint.
+
+    Return both last carries, and both carries before each step.
+    """
     double = jax.jit(lambda a, b: (a * 2, b + 1))
     halve = jax.checkpoint(lambda a: jnp.sin(a) / 2)
     return scan(lambda c, _: (double(*(halve(c[0]), c[1])), c), (x, jnp.zeros(3)), None, 3)
 
 
 def swap(x):
-    """Exchange a carry that differs by trial with a constant carry in each step of a scan."""
+    """Exchange a carry that differs by trial with a constant carry in each step of a scan.
+
+    Return both last carries, and both carries before each step.
+    """
     return scan(lambda c, _: ((c[1], c[0]), c), (x, FIXED), None, 3)
 
 
 def used_in_a_loop_and_after(x, m):
-    """Use the same matrix in a loop and after it."""
+    """Use the same matrix m in a loop and after it; return a vector."""
     x = fori_loop(0, 3, lambda k, x: jnp.tanh(m @ x), x)
     return m @ x
 
 
 def made_used_in_a_loop_and_after(x, y):
-    """Use the same computed value in a loop and after it."""
+    """Use the same computed value in a loop and after it; return two vectors."""
     made = x * y  # computed as components, but sort needs the array
     total = fori_loop(0, 3, lambda k, t: t + jnp.sort(made), x)
     return total, jnp.sort(made) * made
 
 
 def used_in_two_loops(x, m):
-    """Use the same matrix in two loops, one after the other."""
+    """Use the same matrix m in two loops, one after the other; return a vector."""
     x = fori_loop(0, 3, lambda k, x: jnp.tanh(m @ x), x)
     return fori_loop(0, 2, lambda k, x: jnp.sin(m @ x), x)
 
 
 def used_in_an_inner_loop_and_after(x, m):
-    """Use the same matrix in an inner loop and after it, in each step of a scan."""
+    """Use the same matrix m in an inner loop and after it, in each step of a scan.
+
+    Return the last vector, and the vector of each step.
+    """
 
     def outer(x, _):
         x = fori_loop(0, 2, lambda k, x: jnp.tanh(m @ x), x)
@@ -282,7 +306,7 @@ def used_in_an_inner_loop_and_after(x, m):
 
 
 def stepping(a, s):
-    """Increase numbers until their sum exceeds a limit, and count the steps."""
+    """Increase numbers `a` until their sum reaches a limit that depends on s; return them and the number of steps."""
     return while_loop(
         lambda c: jnp.sum(c[0]) < 3 + jnp.sin(s), lambda c: (c[0] + 0.7 * jnp.abs(s) + 0.1, c[1] + 1), (a, 0)
     )
@@ -427,7 +451,10 @@ WITHOUT_RULE = {
 
 @cache
 def mapped(group):
-    """Return the results of lanes and `jax.vmap` for all functions of a group, computed in one compiled program."""
+    """Return {name: results of `jax.vmap`, of lanes and of lanes in a loop} for the functions of a group.
+
+    One compiled program computes all of them.
+    """
     rows = {name: row for name, row in CASES.items() if name.startswith(f"{group}: ")}
 
     @jax.jit
@@ -488,14 +515,20 @@ SHARED_LONG = (
 
 
 def is_short(name, shared):
-    """Return whether a function of the table is in the short tests of derivatives."""
+    """Return whether a row of `CASES` is in the short tests of derivatives.
+
+    shared: whether all trials share its first argument.
+    """
     group, _, row = name.partition(": ")
     is_included = not shared or (group in ("loops", "branches", "contractions") and row not in SHARED_LONG)
     return is_included and row in SHORT_ROWS.get(group, (row,))
 
 
 def jvp_by_lanes_and_jax(name, shared):
-    """Return a function with the tangents along two directions by lanes and by JAX, and its arguments."""
+    """Return a function and its arguments; it returns the tangents along two directions by lanes and by JAX.
+
+    name: of a row of `CASES`. shared: whether all trials share its first argument.
+    """
     function, *args = CASES[name]
     args = [jax.tree.map(lambda v: v[0], args[0]), *args[1:]] if shared else args
     axes = (None, *(0 for _ in args[1:])) if shared else tuple(0 for _ in args)
@@ -528,9 +561,10 @@ def jvp_by_lanes_and_jax(name, shared):
 
 @cache
 def tangents(group, shared, short_rows):
-    """Return the tangents by lanes and by JAX for functions of a group, by name, from one program.
+    """Return {name: (tangents by lanes, tangents by JAX)} for functions of a group, from one program.
 
-    short_rows: whether they are the functions of the short tests or the others.
+    shared: whether all trials share the first argument. short_rows: whether they are the functions of the short tests
+    or the others.
     """
     names = [name for name in CASES if name.startswith(f"{group}: ") and is_short(name, shared) == short_rows]
     names = [name for name in names if (name, shared) in JVP_CASES]

@@ -35,7 +35,7 @@ from tests.helpers import equations
 
 
 def law(x, m, s):
-    """A loop with the kinds of operations of a simulation."""
+    """Return two numbers of a loop with the kinds of operations of a simulation; x: (3,), m: (3, 3), s: scalar."""
 
     def step(c, k):
         force = jnp.cross(c, m @ c) - s * jnp.where(jnp.abs(c) > 0.5, jnp.sign(c), 2 * c)
@@ -46,7 +46,7 @@ def law(x, m, s):
 
 
 def short_law(x, m, s):
-    """A smaller loop, for tests that compile many programs."""
+    """Return the last vector of a smaller loop and three numbers, for tests that compile many programs."""
     return lax.scan(lambda c, _: (jnp.tanh(s * c + m @ x), c[0]), x, None, 3)
 
 
@@ -54,18 +54,18 @@ ARGS = (X, M, S)
 
 
 def loss(vmap, x, m, s, function=law):
-    """Return a scalar of the batched results, for derivatives."""
+    """Return a scalar of the batched results, for derivatives; vmap: of lanes or JAX."""
     end, peaks = vmap(function)(x, m, s)
     return jnp.sqrt(jnp.mean(end**2)) + jnp.mean(peaks)
 
 
 def derivative_along_cosines(vmap, *args):
-    """Return the batched results and their tangents along the cosines of the arguments."""
+    """Return the batched results of `law` and their tangents along the cosines of `args`; vmap: of lanes or JAX."""
     return jax.jvp(vmap(law), args, tuple(jnp.cos(a) for a in args))
 
 
 def gradients(vmap, *args):
-    """Return the gradients of `loss` by all three arguments."""
+    """Return the gradients of `loss` by all three arguments, as a tuple; vmap: of lanes or JAX."""
     return jax.grad(partial(loss, vmap), argnums=(0, 1, 2))(*args)
 
 
@@ -207,7 +207,7 @@ def test_directions_of_lanes_jvp_with_a_wrong_shape_raise_an_error(directions, m
 
 
 def shapes_in_loops(jaxpr, inside=False):
-    """Yield the shapes of all values that are computed in the loops of a jaxpr."""
+    """Yield the shapes of all values that are computed in the scans of a jaxpr, nested jaxprs included."""
     for eqn in jaxpr.eqns:
         loop = inside or eqn.primitive.name == "scan"
         if inside:
@@ -223,7 +223,10 @@ def test_loops_in_lanes_carry_vectors_over_the_trials():
 
 
 def time_and_state_in_a_call(s):
-    """Scan with a jitted step of a time, which does not depend on the trial, and a state, which does."""
+    """Scan with a jitted step of a time, which does not depend on the trial, and a state, which does.
+
+    Return the last time and state, and both before each step.
+    """
     step = jax.jit(lambda t, x: (t + 0.1, x + jnp.exp(-t) * x))
     return lax.scan(lambda c, _: (step(*c), c), (0.0, s), None, 6)
 

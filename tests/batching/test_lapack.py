@@ -21,7 +21,10 @@ pytestmark = pytest.mark.skipif(not lapack.CAN_DEADLOCK, reason="this jaxlib can
 
 
 def lapack_calls(trace):
-    """Return the operations of the largest LAPACK call in a trace, and whether one of `NEVER_BATCHED` is batched."""
+    """Return the size of the largest LAPACK call in a trace, and whether one of `NEVER_BATCHED` is batched.
+
+    The size is the number of elements of the last operand times the number of columns of the first one.
+    """
     found = [e for e in equations(trace) if e.primitive.name in lapack.SIZE_LIMITED | lapack.NEVER_BATCHED]
     assert found
     is_batched = any(e.primitive.name in lapack.NEVER_BATCHED and e.invars[0].aval.ndim > 2 for e in found)
@@ -29,7 +32,7 @@ def lapack_calls(trace):
 
 
 def eigenvalues(a):
-    """Return the eigenvalues of a symmetric matrix."""
+    """Return the eigenvalues (n,) of a symmetric matrix (n, n)."""
     return jnp.linalg.eigh(a)[0]
 
 
@@ -63,13 +66,13 @@ def test_functions_without_lapack_use_jax_vmap():
 
 
 def identity_by_eigh(v):
-    """Return the vector v, after a call of `eigh`."""
+    """Return the vector v (n,) itself, after a call of `eigh`."""
     values, axes = jnp.linalg.eigh(jnp.diag(jnp.arange(1.0, v.size + 1.0)) + 0.1 * jnp.outer(v, v))
     return axes @ ((axes.T @ v) * values / values)
 
 
 def rate_of_x_1(t, x_1, x_2):
-    """Return x_1' of a system with an oscillating target."""
+    """Return x_1' = x_2 - sin t (m,) of a system, after a call of `eigh`."""
     return identity_by_eigh(x_2 - jnp.sin(t))
 
 
@@ -85,13 +88,13 @@ class EighReference(ptsmc.Reference):
     """A constant attitude that calls `eigh`."""
 
     def attitude(self, t):
-        """Return the identity."""
+        """Return the identity quaternion (4,)."""
         return identity_by_eigh(jnp.stack([0.0 * t, 0.0, 0.0, 1.0]))
 
 
 @pytest.fixture
 def batched_calls(monkeypatch):
-    """Return a list, which receives the batched calls of the primitives in `NEVER_BATCHED` of any trace."""
+    """Return a list, which receives a text such as "eigh of (4, 3, 3)" for each batched call of `NEVER_BATCHED`."""
     calls = []
     for p in (p for p in vars(core.primitives).values() if getattr(p, "name", None) in lapack.NEVER_BATCHED):
 
@@ -111,7 +114,10 @@ CUSTOM = {
 
 
 def trace_analyses(parts, dispersion):
-    """Trace the moments and the rest point of the loop, the test vectors of the C export, and predicted peaks."""
+    """Trace the moments and the rest point of the loop, the test vectors of the C export, and predicted peaks.
+
+    The function returns nothing: it only calls the primitives that `batched_calls` records.
+    """
     trials, seed, run = jnp.arange(4, dtype=jnp.uint32), jnp.uint32(0), jax.eval_shape(linear.simulate_nominal, parts)
     run_margins._find_period_indices_jit.trace(parts, run, run_margins.judged_times(parts))
     limit_cycles._nonlinear_residual.trace(parts, run)

@@ -21,13 +21,13 @@ from tests.helpers import SHORT, SHORT_CHAIN, same, short, untuned
 
 
 def of_scenario(tables, seed):
-    """Return the campaign of a scenario's tables with this seed."""
+    """Return the `Campaign` of a scenario's tables with this seed."""
     return campaign.Campaign(scenario.study(scenario.from_tables(tables)), seed)
 
 
 @pytest.fixture(scope="module")
 def simulated():
-    """Return the campaign of a short integrator chain and the rows of its first 300 trials."""
+    """Return the `Campaign` of a short integrator chain and the data frame of its first 300 trials."""
     made = of_scenario(untuned(SHORT_CHAIN), 3)
     return made, made.simulate(range(300))
 
@@ -183,7 +183,7 @@ def test_failed_trials_are_counted_in_the_progress_of_a_campaign(simulated, tmp_
 
 
 def overshoot(result, parts):
-    """Return custom metrics: the largest error after t_f, and the number of rows of the history."""
+    """Return custom metrics by name: the largest error after t_f, and the number of rows of the history."""
     error = jnp.sqrt(jnp.sum(result.log.error**2, axis=-1))
     late = result.log.t > parts.controller.t_f
     return {"overshoot": jnp.max(jnp.where(late, error, 0.0)), "rows": jnp.sum(result.log.has_length)}

@@ -22,24 +22,24 @@ SLOW = SHORT_CHAIN.replace("t_f = 5.0", "t_f = 15.0").replace("t_end = 6.5", "t_
 
 
 def environment():
-    """Return the environment of a process that imports this source tree and compiles quickly."""
+    """Return the environment variables of a process that imports this source tree and compiles quickly."""
     return dict(os.environ, PYTHONPATH=str(ROOT), XLA_FLAGS=f"{os.environ.get('XLA_FLAGS', '')} {QUICKLY}")
 
 
 def started(folder, *options, **others):
-    """Start `ptsmc montecarlo` with these options in a folder, and return the process."""
+    """Start `ptsmc montecarlo` with these options in a folder; return the `Popen`. others: arguments of `Popen`."""
     return subprocess.Popen([*PTSMC, *COMMAND, *options], cwd=folder, env=environment(), text=True,
                             stdout=subprocess.PIPE, stderr=subprocess.PIPE, **others)  # fmt: skip
 
 
 def ended(run, seconds=300):
-    """Wait for the end of a process and return its exit status and error output."""
+    """Wait at most `seconds` for the end of a process; return its exit status and the text on stderr."""
     _, error = run.communicate(timeout=seconds)
     return run.returncode, error
 
 
 def parts(folder):
-    """Return the names of the campaign's files of rows."""
+    """Return the sorted names of the campaign's files of rows."""
     return sorted(path.name for path in (folder / RESULTS / "trials").glob("*.parquet"))
 
 
@@ -60,7 +60,10 @@ main()
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """The rows of an uninterrupted run. Its first attempt found a full disk, reported it, and left no parts."""
+    """Return the rows (a data frame) of an uninterrupted run.
+
+    Its first attempt found a full disk, reported it, and left no parts.
+    """
     folder = tmp_path_factory.mktemp("whole")
     (folder / "s.toml").write_text(SLOW)
     call = [sys.executable, "-c", FULL_AT_FIRST, *COMMAND, "--trials", str(TRIALS)]
@@ -82,7 +85,10 @@ def folder(tmp_path):
 
 
 def await_parts(folder, count, run, patience=120.0):
-    """Wait for this number of parts, and return whether the process still runs."""
+    """Wait until the campaign has `count` parts (True) or the process has ended (False).
+
+    patience: time [s] after which the test fails. run: the process.
+    """
     since = time.monotonic()
     while run.poll() is None:
         if len(parts(folder)) >= count:

@@ -13,7 +13,10 @@ from ptsmc_jax.campaigns.store import RefusedError
 
 
 class FakeClient:
-    """A fake client of Dask, which runs submitted functions immediately and records its own options."""
+    """A fake client of Dask, which runs submitted functions immediately and records its own options.
+
+    `FakeClient.made` is the client that was created last.
+    """
 
     loop = None
 
@@ -22,7 +25,7 @@ class FakeClient:
         FakeClient.made = self
 
     def submit(self, function, *arguments, **_):
-        """Run the function and return a finished future."""
+        """Run the function at once and return a finished future with its result or its exception."""
         future = Future()
         try:
             future.set_result(function(*arguments))

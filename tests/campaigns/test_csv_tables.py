@@ -15,7 +15,7 @@ SEMICOLONS = "x1;x2\n1,5;-0,25\n1e-3;0,02\n"
 
 
 def numbers(table):
-    """Return the columns x1 and x2 as numbers (rows, 2)."""
+    """Return the columns x1 and x2 of a data frame as numbers (rows, 2)."""
     return table.select("x1", "x2").cast(pl.Float64).to_numpy()
 
 

@@ -13,7 +13,7 @@ from tests.helpers import ROOT, SHORT_CHAIN, tree
 
 
 def refused(folder, **options):
-    """Return whether the folder cannot be locked, because another writer uses it."""
+    """Return whether another writer uses the folder, so that it cannot be locked; options: of `lock_folder`."""
     try:
         with store.lock_folder(folder, **options):
             return False

@@ -129,7 +129,7 @@ def _few_loops():
 def loops_and_margins(parts, dispersion, seed, late):
     """Return the loops (TRIALS, times, ..) of the first trials, and their margins interpolated over frequency.
 
-    If `late` is set, the loops allow delays by a fraction of a period.
+    late: whether the loops allow delays by a fraction of a period.
     """
     arguments = margin_verdicts._arguments(parts, dispersion, seed, np.arange(TRIALS), late)
     *every, _ = margin_verdicts._loops_and_margins(*arguments)
@@ -137,9 +137,10 @@ def loops_and_margins(parts, dispersion, seed, late):
 
 
 def all_of(parts, dispersion, seed, late=False):
-    """Return the exact margins of the first trials' loops, (TRIALS, times) each, computed trial by trial.
+    """Return {margin: (TRIALS, times)}, the exact margins of the first trials' loops, computed trial by trial.
 
-    If `late` is not set, the delay margin is the phase margin over the crossover frequency, without the hold.
+    late: whether the loops allow delays by a fraction of a period. Otherwise the delay margin is the phase margin over
+    the crossover frequency, without the hold.
     """
     loops, _ = loops_and_margins(parts, dispersion, seed, late)
     each = [margins.compute_each(jax.tree.map(lambda v, k=k: v[k], loops), with_delay=late) for k in range(TRIALS)]
@@ -149,12 +150,15 @@ def all_of(parts, dispersion, seed, late=False):
 
 
 def worst_of(each):
-    """Return the worst margins of each trial over its times."""
+    """Return {margin: (TRIALS,)}, the worst margin of each trial over its times; each: from `all_of`."""
     return {name: farthest(name, v, 1) for name, v in each.items()}
 
 
 def sloped(asked, bounds, normalised):
-    """Return the constraints on margins and their gradients at one point of normalised gains."""
+    """Return "c" (margins, entries) and "c_gradient" (margins, entries, gains) at one point of normalised gains.
+
+    asked: the required margins. bounds: of the gains.
+    """
     return {
         name: v[0]
         for name, v in margin_rows.constraints_at_points(asked, bounds.scale, np.asarray(normalised)[None]).items()
@@ -204,7 +208,7 @@ DRAWN = {
 
 
 def posed_of(plant):
-    """Return the tuning problem of this plant with its dispersions, and with the hardest trials for its gains."""
+    """Return the tuning problem of a plant in `DRAWN` with its dispersions and the hardest trials for its gains."""
     tables = DRAWN[plant]
     posed = posing.set_up_tuning(
         scenario.from_tables({**tables, "requirements": {**tables["requirements"], "peak_torque": 5.0}}), 3
@@ -377,7 +381,7 @@ LOOKED = [*((factors, True) for factors in FACTORS), (FACTORS[2], False)]
 
 
 def changed(posed, factors):
-    """Return the parts with the gains multiplied by these factors."""
+    """Return the parts with the gains multiplied by these factors, in the order of the problem's names."""
     return with_gains(
         posed.problem.parts, dict(zip(posed.problem.names, posed.scenario_gains * np.asarray(factors), strict=True))
     )
@@ -428,7 +432,7 @@ def test_worst_margins_are_exact_without_exact_margins_of_all_loops(drawn, facto
 
 
 class _Told(NamedTuple):
-    """Fake loops, which only have a number and a period."""
+    """Fake loops, which have only a number and a period [s]."""
 
     number: Any
     period: Any

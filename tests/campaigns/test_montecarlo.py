@@ -29,7 +29,7 @@ def chain():
 
 @pytest.fixture(scope="module")
 def simulated(chain):
-    """Return the results of the first 256 trials of the chain."""
+    """Return the `Trials` of the first 256 trials of the chain with seed 5."""
     return montecarlo.run(chain.parts, chain.dispersion, 5, np.arange(256))
 
 

@@ -13,7 +13,7 @@ KEY = rows.campaign_key({"loop": {"period": 0.1}}, {"seed": 1})
 
 
 def frame(first, count):
-    """Return rows of `count` successive trials."""
+    """Return a data frame of `count` successive trials with the columns trial and x."""
     return pl.DataFrame({"trial": np.arange(first, first + count, dtype=np.uint32), "x": np.arange(count) / 7.0})
 
 

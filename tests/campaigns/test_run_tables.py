@@ -63,26 +63,26 @@ dispersion = { x0 = { kind = "normal" }, state_noise = { kind = "relative_normal
 
 
 def ready(text):
-    """Return the study of a scenario in TOML."""
+    """Return the study of a scenario; text: of the scenario in TOML."""
     return scenario.study(scenario.from_tables(tomllib.loads(text)))
 
 
 @pytest.fixture(scope="module")
 def everything():
-    """A spacecraft campaign with a dispersion of every quantity, and its run table."""
+    """Return a spacecraft campaign with a dispersion of every quantity, and its run table (a data frame)."""
     made = campaign.Campaign(ready(EVERYTHING), SEED)
     return made, made.draw(range(TRIALS))
 
 
 @pytest.fixture(scope="module")
 def of_a_chain():
-    """A campaign that uses the compiled program of other tests, and its run table."""
+    """Return a campaign that uses the compiled program of other tests, and its run table (a data frame)."""
     made = campaign.Campaign(scenario.study(scenario.from_tables(untuned(SHORT_CHAIN))), SEED)
     return made, made.draw(range(TRIALS))
 
 
 def of_run_table(made, table):
-    """Return the campaign with the trials of a run table."""
+    """Return the campaign `made` with the trials of a run table (a data frame) instead of its random trials."""
     return campaign.from_run_table(made.ready, made.seed, run_tables.check_table(table, made.ready.parts))
 
 
@@ -169,7 +169,7 @@ def test_other_values_of_a_custom_dispersion_in_a_run_table_are_refused():
 
 @pytest.fixture(scope="module")
 def corners(everything):
-    """A run table with values that differ from the random ones for every quantity, and its campaign."""
+    """Return a run table of two rows and its campaign. Its values differ from the random ones for every quantity."""
     made, run_table = everything
     generator = np.random.default_rng(1)
     table = run_table.head(2).drop("trial", "initial_angle")
@@ -184,7 +184,7 @@ def corners(everything):
 
 
 def stands(given, table):
-    """Assert that rows have the values of the run table `table`."""
+    """Assert that rows of a campaign (`given`) have the values of the run table `table`."""
     assert given["run_trial"].to_list() == [5, 9]
     assert given["run_seed"].to_list() == [SEED, 11]
     for name in set(table.columns) - {"trial", "seed"}:  # quaternions come normalised
@@ -232,7 +232,7 @@ def test_simulation_with_parts_set_by_hand_reproduces_a_row(everything, corners,
 
 
 def set_by_hand(parts, row):
-    """Return the nominal parts with every value of a spacecraft row."""
+    """Return the nominal parts with every value of a spacecraft row; row: a dict of values by column."""
     row = dict(row)
 
     def take_vector(name, count):
@@ -267,7 +267,7 @@ def set_by_hand(parts, row):
 
 
 def made_of_a_run():
-    """Return the columns of a row that are not inputs."""
+    """Return the names of the columns of a row that are not inputs."""
     return ("trial", "run_trial", "run_seed", "status", "reason", "bad_time", *catalogues.CATALOGUES["spacecraft"])
 
 
@@ -305,7 +305,7 @@ def test_quantities_are_read_as_written_and_do_not_change_the_controller(text):
 
 
 def onboard(parts):
-    """Return the flight software of the parts: controller, observer and attitude filter."""
+    """Return the flight software of the parts: controller, observer, and attitude filter or None."""
     return parts.controller, parts.observer, getattr(parts.sensors, "filter", None)
 
 

@@ -126,7 +126,7 @@ def test_unfinished_run_is_found_only_for_the_same_list_of_sensors(tmp_path):
 
 
 def fill(folder):
-    """Write a figure and a summary into a folder."""
+    """Write figures/a.png and summary.json, both with the text "new", into a folder."""
     (folder / "figures").mkdir()
     (folder / "figures" / "a.png").write_text("new")
     (folder / "summary.json").write_text("new")
@@ -312,7 +312,7 @@ def test_a_written_scenario_file_has_the_units_of_its_numbers_in_comments(tmp_pa
 
 
 def finished(folder, tables):
-    """Create the result folder of a finished search with this scenario."""
+    """Create the result folder of a finished search with the status "met" and these tables of a scenario."""
     folder.mkdir()
     store.write_toml(folder / "scenario.toml", tables)
     store.write_json(folder / "versions.json", store.versions("tune", 5))

@@ -28,7 +28,7 @@ class Rows:
     units = campaign_folder.Folder.units
 
     def intact_parts(self):
-        """Return the only file of rows."""
+        """Return a list with the only file of rows, which this object stands for."""
         return [self]
 
 

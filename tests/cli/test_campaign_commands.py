@@ -31,7 +31,7 @@ nothing = 3
 
 
 def summary(folder):
-    """Return the content of summary.json in a folder."""
+    """Return the content of summary.json in a folder as a dict."""
     return json.loads((folder / "summary.json").read_text())
 
 
@@ -422,7 +422,11 @@ def test_repeated_summary_does_not_depend_on_the_order_of_limits(command, tmp_pa
 
 @pytest.fixture
 def lost(monkeypatch):
-    """Return a function that makes every fourth trial fail. `test_campaign.py` simulates trials that fail."""
+    """Return a function without arguments; after its call, every fourth trial fails, from trial 0 on.
+
+    Trials whose number is divisible by 8 diverge, and the others become singular. `test_campaign.py` simulates trials
+    that fail.
+    """
 
     def run(parts, dispersion, seed, trials, *more, simulated=montecarlo.run, **how):
         result, fails = simulated(parts, dispersion, seed, trials, *more, **how), np.asarray(trials) % 4 == 0

@@ -483,7 +483,10 @@ def test_exit_status_is_1_for_a_violated_requirement_and_2_for_a_configuration_e
 
 
 def in_a_process(*args, then="", **variables):
-    """Run `ptsmc` in a new process; then: Python code to execute at its end."""
+    """Run `ptsmc` in a new process and return the finished process with its output as text.
+
+    args: of `ptsmc`. then: Python code to execute at its end. variables: environment variables.
+    """
     code = f"import sys\nfrom tuning.cli.main import main\ntry: main()\nfinally:\n    {then or 'pass'}"
     command, quickly = [sys.executable, "-c", code, *map(str, args)], os.environ | {"XLA_FLAGS": QUICKLY} | variables
     return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=quickly, check=False)

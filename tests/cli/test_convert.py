@@ -14,7 +14,10 @@ from tuning.cli import convert
 
 
 def pasted(line, sequence):
-    """Return the quaternion of a printed line, which is read as a part of a scenario."""
+    """Return the quaternion (4,), scalar last, of a printed line, which is read as a part of a scenario.
+
+    sequence: of the Euler angles, used if the line has Euler angles.
+    """
     table = tomllib.loads(line)
     if "euler_deg" in table:
         table["sequence"] = sequence
@@ -23,7 +26,7 @@ def pasted(line, sequence):
 
 
 def closed_forms(q):
-    """Return MRP, rotation vector [deg] and rotation matrix of a quaternion from their definitions."""
+    """Return MRP (3,), rotation vector (3,) [deg] and rotation matrix (3, 3) of a quaternion from their definitions."""
     v, scalar = q[:3], q[3]
     angle = 2.0 * np.arctan2(np.linalg.norm(v), scalar)
     x, y, z = v

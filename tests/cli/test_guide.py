@@ -15,7 +15,7 @@ SMALLER = {"--trials 2000": "--trials 64", "--law mine.py:Growing": "--law mine.
 
 
 def calls():
-    """Return every command in the shell blocks of the guide, without the installation."""
+    """Return a list of all commands in the shell blocks of the guide, without the installation."""
     blocks = re.findall(r"^```(\S*)[^\n]*\n(.*?)^```", GUIDE, re.M | re.S)
     return [line.split("#")[0].strip() for language, block in blocks if not language for line in block.splitlines()]
 

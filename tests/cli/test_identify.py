@@ -32,7 +32,7 @@ prior = "none"
 
 @pytest.fixture
 def logged(command, tmp_path):
-    """Return a folder with a scenario, and a log of a plant with 1.25 times the scenario's actuator torque."""
+    """Return a folder with the scenario s.toml, and a log in run/ of a plant with 1.25 times its actuator torque."""
     (tmp_path / "true.toml").write_text(SCENARIO.replace("[hardware]", "[hardware]\nactuator_scale = [1.25]"))
     assert command("simulate", "true.toml", "--out", "run", "--no-figures", "--quiet")[0] == 0
     return tmp_path

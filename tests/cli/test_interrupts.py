@@ -76,13 +76,16 @@ def shown(monkeypatch):
 
 
 def search_of(status, write, command="tune"):
-    """Return a fake search that ends with this status; `write` fills its folder."""
+    """Return a fake `LongSearch` that ends with this status.
+
+    write: function of the folder and the outcome that fills the folder. command: the command that starts the search.
+    """
     made_by = {"command": command, "seed": 0}
     return searches.LongSearch(made_by, "window error", lambda *_: SimpleNamespace(status=status), write)
 
 
 def recorded(summary, command="tune"):
-    """Return a function that writes a result folder with this summary."""
+    """Return a function of a folder and an outcome that writes a result folder with this summary; it is a `write`."""
     made_by = {"command": command, "seed": 0}
     return lambda making, _: store.write_run_files(making, parsing.dump(LOADED), made_by, summary)
 

@@ -37,9 +37,9 @@ drawn, values = jax.jit(lambda parts, dispersion, *at: dispersion.apply(parts, *
 
 @pytest.fixture(scope="module")
 def one_by_one():
-    """A replacement of `montecarlo.run` with the compiled program of single trials, which the lower bound uses too.
+    """Return a replacement of `montecarlo.run` with the compiled program of single trials.
 
-    It simulates each trial once.
+    The lower bound uses this program too. The replacement simulates each trial once and then remembers it.
     """
     known = {}
 
@@ -62,7 +62,7 @@ def one_by_one():
 # `test_montecarlo.py` and `test_lanes.py` test batches
 @pytest.fixture(params=short(["alone", "in a batch"], ["alone"]))
 def simulated(request, command, tmp_path, monkeypatch, one_by_one):
-    """Return exit status, output, rows and summary of a campaign with pointing requirements."""
+    """Return exit status, stdout, rows (a data frame) and summary (a dict) of a campaign with pointing requirements."""
     if request.param == "alone":
         monkeypatch.setattr(montecarlo, "run", one_by_one)
         monkeypatch.setattr(montecarlo, "prepare", lambda *_: None)

@@ -21,15 +21,15 @@ KINDS = {
 
 
 def digital(kind):
-    """Return numerator and denominator of a filter in z by the bilinear transform, prewarped at W."""
+    """Return numerator and denominator in z by the bilinear transform, prewarped at W; kind: key of `KINDS`."""
     _, b, a = KINDS[kind]
     return signal.bilinear(b, a, fs=W / (2.0 * np.tan(W * H / 2.0)))
 
 
 def filtered(device, u, lengths):
-    """Return outputs of a filter from rest for inputs u (samples,).
+    """Return the outputs (samples,) of a filter from rest for inputs u (samples,).
 
-    The periods between the samples have these lengths (samples - 1,) [s].
+    lengths: of the periods between the samples, (samples - 1,) [s].
     """
     kept, out = device.begin(1), []
     for value, before, after in zip(u, [0.0, *lengths], [*lengths, H], strict=True):

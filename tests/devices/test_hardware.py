@@ -24,7 +24,7 @@ PYRAMID = formulas.pyramid()
 
 
 def drive_of(device, v, c):
-    """Return the drive of channels with the torque v at the start of a period and the command c [N m]."""
+    """Return the drive of channels with the torque v (m,) at the start of a period and the command c (m,) [N m]."""
     return actuators.Drive(vector(v), vector(c), None, jnp.asarray(False))
 
 
@@ -62,7 +62,11 @@ def test_torques_of_actuator_channels_follow_their_differential_equation(lag, ra
 
 
 def commanded(device, u, *, v=None, h=None, dt=0.1):
-    """Return the drive of a command in one period from t = 0, and the actuator state at the end of the period."""
+    """Return the `Drive` of a command u (3,) [N m] in one period from t = 0, and the actuator state at its end.
+
+    v: torque of each channel at the start [N m]. h: momentum of each wheel [N m s]. If they are None, the device has no
+    such state. dt: length of the period [s].
+    """
     state = actuators.ActuatorState(None, None if v is None else vector(v), None if h is None else vector(h))
     t, dt, rest = vector(0.0), vector(dt), vector([0.0] * 3)
     drive, queue = device.command(state, vector(u), rest, t, dt, vector(1.0))
@@ -110,7 +114,7 @@ def test_quantisation_rounds_the_torque_and_has_derivative_one():
 
 
 def with_device(device, t_end=23.0, **changes):
-    """Return the parts of a noisy slew of 20 s with these actuators."""
+    """Return the parts of a noisy slew of 20 s with these actuators; changes: of `helpers.parts`."""
     run = parts(20.0, 3.0, 1.0, period=0.1, noise=(2e-5, 1e-6), flight=True, t_end=t_end, **changes)
     return dataclasses.replace(run, actuators=device)
 
@@ -131,9 +135,10 @@ def test_limited_and_quantised_torque_is_delivered_after_the_delay(step):
 
 
 def wheels_by_an_adaptive_integrator(inertia, axes, log, lag, limit, intervals):
-    """Return attitude and wheel momenta after some periods, integrated from the first row of the log.
+    """Return attitude (4,) and wheel momenta (n,) after some periods, integrated from the first row of the log.
 
-    The equations are J w' = A v - w x (J w + A h) and h' = -v.
+    The equations are J w' = A v - w x (J w + A h) and h' = -v. axes: A (3, n). lag: time constant [s] of the torque, or
+    None. limit: largest rate of the torque [N m/s]. intervals: number of periods.
     """
     n, inverse = axes.shape[1], np.linalg.inv(inertia)
     y = np.concatenate([log.x.q[0], log.x.w[0], log.wheels[1][0], log.wheels[0][0]])
@@ -262,7 +267,7 @@ def test_wheel_momentum_that_is_too_large_for_the_control_period_raises_an_error
 
 
 def with_spinning(wheels, **changes):
-    """Return the parts of a slew with these wheels, without noise and disturbance."""
+    """Return the parts of a slew with these wheels, without noise and disturbance; changes: of `helpers.parts`."""
     quiet = disturbances.Constant(vector([0.0] * 3))
     run = parts(20.0, 3.0, 1.0, period=0.1, flight=True, disturbance=quiet, **changes)
     return dataclasses.replace(run, actuators=actuators.Actuators(wheels=wheels))
@@ -309,7 +314,7 @@ def test_wheel_allocation_gives_the_commanded_torque_for_any_wheel_axes():
 
 
 def everything(delta=0.93, **changes):
-    """Return the parts of a run with every device enabled."""
+    """Return the parts of a run with every device enabled; changes: of `helpers.parts`."""
     run = parts(
         15.0,
         3.2,
@@ -333,7 +338,7 @@ def everything(delta=0.93, **changes):
 
 
 def window_error_with_every_device(eta, delta, gain):
-    """Return the window error of a noisy run with every device and these gains of law and observer."""
+    """Return the window error, a scalar, of a noisy run with every device and these gains of law and observer."""
     run = with_controller(everything(), eta=eta, delta=delta)
     run = dataclasses.replace(run, observer=dataclasses.replace(run.observer, gain=jnp.full(3, gain)))
     return rollout.simulate(run, 3, 5).metrics.window_error
@@ -341,7 +346,10 @@ def window_error_with_every_device(eta, delta, gain):
 
 @programs.jit
 def window_error_and_derivative(gains, along):
-    """Return the window error and its derivative along a direction of eta, delta and the observer's gain."""
+    """Return the window error and its derivative along a direction of the gains (3,).
+
+    gains, along: values and direction of eta, delta and the observer's gain.
+    """
     return jax.jvp(lambda gains: window_error_with_every_device(*gains), (gains,), (along,))
 
 

@@ -23,7 +23,7 @@ RATE = np.array([0.02, -0.03, 0.05])  # [rad/s], constant, so that the filter pr
 
 
 def tick(sample):
-    """Return the control period after a sample, of a clock that starts at t = 0."""
+    """Return the control period after a sample with this number, of a clock that starts at t = 0."""
     t = sample * vector(H)
     return Ticks(t, t + H, jnp.asarray(False), jnp.asarray(sample), vector(1.0), jnp.asarray(False))
 
@@ -34,7 +34,10 @@ def state(t):
 
 
 def filtered(suite, trial, count):
-    """Return errors (count, 9) of attitude, bias and gyro noise after each sample, and the filter's covariances."""
+    """Return errors (count, 9) after each sample, and the filter's covariances (count, 9, 9).
+
+    The errors are attitude [rad], gyro bias [rad/s] and gyro noise [rad/s], three axes each.
+    """
 
     def step(memory, k):
         dt = jnp.where(k > 0, H, 0.0)
@@ -52,7 +55,10 @@ def filtered(suite, trial, count):
 
 
 def sun_and_field(period):
-    """Return a suite of two vector sensors with different rates and latencies. Only both determine the attitude."""
+    """Return a suite of two vector sensors with different rates and latencies; period: of the control loop [s].
+
+    Only both sensors together determine the attitude.
+    """
     made = []
     for k, (direction, interval, latency) in enumerate([([0.6, 0.0, 0.8], 2, 1), ([0.0, 1.0, 0.0], 3, 0)]):
         made.append(

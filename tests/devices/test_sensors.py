@@ -29,7 +29,7 @@ def tick(sample, weight=1.0):
 
 
 def seen_by(sensor, x, seed, trial, sample):
-    """Return the measured state of a sensor at one sample."""
+    """Return the state that a sensor measures at one sample, for the true state x; sample: its number."""
     return sensor.measure(sensor.begin(seed, trial, x, tick(sample)), x, tick(sample), vector(0.05))[0]
 
 
@@ -118,10 +118,11 @@ def filtered():
 
 
 def steady():
-    """Return the steady-state covariance of a filter's errors just before each control sample, by iteration.
+    """Return the steady-state covariances (every, 2, 2) of a filter's errors just before each control sample.
 
-    The iterated states are attitude, bias and the gyro noise at the sample, because each gyro sample acts in two
-    periods. The function also returns the correction matrix and the noise covariance of a star tracker sample.
+    The errors are attitude [rad] and bias [rad/s]. The function also returns the correction matrix (2, 2) and the noise
+    covariance (2, 2) of a star tracker sample. The iteration has a third state, the gyro noise at the sample, because
+    each gyro sample acts in two periods.
     """
     h, every, noise, gyro, walk, bandwidth = TRACKED.values()
     k1, k2 = (float(v) for v in attitude_filter.filter_gains(vector(bandwidth), h * every))

@@ -44,7 +44,10 @@ def test_star_tracker_samples_are_used_at_the_same_times_in_32_bits(interval):
 
 
 def by_hand(parts, simulated):
-    """Return the filter's attitude (as a rotation) and bias at each sample, computed with NumPy and SciPy."""
+    """Return [(attitude as a `Rotation`, bias (3,) [rad/s]) after each sample], computed with NumPy and SciPy.
+
+    simulated: the samples of a run of the parts.
+    """
     known = parts.sensors.filter
     k1, k2 = float(known.attitude_gain), float(known.bias_gain)
     said = [(Rotation.from_quat(simulated.before["attitude"][0]), simulated.before["bias"][0])]

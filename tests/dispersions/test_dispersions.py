@@ -40,7 +40,7 @@ KINDS = {
 
 
 def initial_attitude(kind, seed, trial):
-    """Return the random initial attitude, a quaternion, of a trial."""
+    """Return the random initial attitude, a quaternion (4,), of a trial; kind: its distribution."""
     return Dispersion({"initial_attitude": kind}).apply(PARTS, seed, trial).initial.q
 
 
@@ -79,7 +79,10 @@ def test_random_numbers_are_quantiles_of_their_distribution(name):
 
 
 def parts_at(run, given):
-    """Return the parts of a trial; given: distribution and coordinates of each random quantity."""
+    """Return the parts of a trial of `run`.
+
+    given: {quantity: (distribution, coordinates)} of each random quantity.
+    """
     coordinates = {name: vector(c) for name, (_, c) in given.items()}
     return Dispersion({name: kind for name, (kind, _) in given.items()}).at(run, coordinates)
 
@@ -143,12 +146,15 @@ def test_initial_states_of_a_chain_use_their_random_stream():
 
 
 def uniform_phases(count):
-    """Return the distribution of phases that are uniform from 0 to 2 pi."""
+    """Return the distribution of `count` phases that are uniform from 0 to 2 pi."""
     return RandomNumbers("interval", vector(np.full(count, 2.0 * np.pi)))
 
 
 def sample_inertias(moments, std, turn=0.0, axes=None):
-    """Return random inertias and their inverses (TRIALS, 3, 3) about these principal moments."""
+    """Return two arrays (TRIALS, 3, 3): random inertias about these principal moments, and their inverses.
+
+    std: relative, of the moments. turn: std [rad] of the rotation of the axes. axes: nominal principal axes (3, 3).
+    """
     axes = np.eye(3) if axes is None else axes
     kind = numbers.RelativeInertia(vector(moments), vector(axes), vector(std), vector(turn))
     plant = plants_of(Dispersion({"inertia": kind}), jnp.arange(TRIALS, dtype=jnp.uint32))

@@ -50,13 +50,17 @@ def dispersed():
 
 
 def numbers(row, name, *shape):
-    """Return the numbers of a quantity from the columns of a trial."""
+    """Return the values of a quantity as an array of this shape; row: {column: value} of a trial."""
     values = [v for key, v in row.items() if key.rpartition("_")[0] == name]
     return vector(np.array(values).reshape(shape))
 
 
 def with_hardware_errors(parts, frequency, coupling, device, sensors):
-    """Return the parts of the flexible spacecraft with these hardware errors."""
+    """Return the parts of the flexible spacecraft with these hardware errors.
+
+    frequency: of the modes [rad/s]. coupling: (modes, 3). device: arguments of `Actuators`. sensors: changed fields of
+    the sensors.
+    """
     body = parts.plant
     plant = flexible_body.flexible(body.inertia, frequency, body.damping, coupling).with_rest_inverse()
     device, sensors = actuators.Actuators(**device), replace(parts.sensors, **sensors)

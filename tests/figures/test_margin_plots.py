@@ -9,7 +9,7 @@ from ptsmc_jax.theory.margins import Margins
 
 
 def margins(times):
-    """Return equal margins about three axes at each of `times` times."""
+    """Return margins (times, 3) of stable loops: every margin is 6 at each time and about each axis."""
     numbers = np.full((times, 3), 6.0)
     values: dict[str, Any] = dict.fromkeys(Margins._fields, numbers) | {"stable": np.full((times, 3), True)}
     return Margins(**values)

@@ -7,7 +7,7 @@ SPIN_INERTIA = 1e-5  # of each wheel [kg m^2]
 
 
 def cross(a, b):
-    """Return the cross products of vectors (.., 3)."""
+    """Return the cross products (.., 3) of vectors (.., 3)."""
     return np.stack([
         a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1],
         a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2],
@@ -16,13 +16,13 @@ def cross(a, b):
 
 
 def multiply(p, q):
-    """Return the products of quaternions (.., 4), scalar last."""
+    """Return the products (.., 4) of quaternions (.., 4), scalar last."""
     v = p[..., 3:] * q[..., :3] + q[..., 3:] * p[..., :3] + cross(p[..., :3], q[..., :3])
     return np.concatenate([v, p[..., 3:] * q[..., 3:] - np.sum(p[..., :3] * q[..., :3], -1, keepdims=True)], -1)
 
 
 def small(turn):
-    """Return the quaternions (.., 4) of rotation vectors (.., 3) [rad]."""
+    """Return the quaternions (.., 4), scalar last, of rotation vectors (.., 3) [rad]."""
     angle = np.linalg.norm(turn, axis=-1, keepdims=True)
     return np.concatenate([0.5 * np.sinc(angle / (2.0 * np.pi)) * turn, np.cos(angle / 2.0)], -1)
 
@@ -110,7 +110,10 @@ def logs(
 
 
 def spoiled(frame, rng, outliers=0.01, missing=0.3):
-    """Return a log with gross outliers and missing samples of star tracker and gyro, as fractions of its rows."""
+    """Return a log with gross outliers and missing samples of star tracker and gyro.
+
+    outliers, missing: fractions of the rows. Missing samples are NaN.
+    """
     columns = {name: frame[name].to_numpy().copy() for name in frame.columns}
     for block, size in (("measured_q", 4), ("measured_w", 3)):
         names = [f"{block}{k + 1}" for k in range(size)]

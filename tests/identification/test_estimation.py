@@ -22,7 +22,10 @@ ENTRIES = np.array([TRUE[i, j] for i, j in PAIRS])
 
 
 def satellite(free=("inertia", "gyro_bias"), **tables):
-    """Return a scenario of a small satellite whose inertia is up to 30 % off `TRUE`."""
+    """Return a scenario of a small satellite whose inertia is up to 30 % off `TRUE`.
+
+    free: the parameters to estimate. tables: other tables of the scenario.
+    """
     return scenario.from_tables(
         {
             "spacecraft": {"inertia": [0.065, 0.072, 0.12]},
@@ -37,14 +40,17 @@ def satellite(free=("inertia", "gyro_bias"), **tables):
 
 
 def flight(rng, **others):
-    """Return an independently simulated log of the satellite with its true inertia, and its gyro bias [rad/s]."""
+    """Return a simulated log (a data frame) of the satellite with its true inertia, and its gyro bias (3,) [rad/s].
+
+    The simulation is independent of the code under test. others: arguments of `synthetic.logs`.
+    """
     (frame,), drift = synthetic.logs(rng, TRUE, dt=0.25, rows=257, wheels=True, lag=0.05, **others)
     return frame, drift[0]
 
 
 @pytest.fixture(scope="module")
 def identified():
-    """Return the result for a log with outliers and missing samples, and the true gyro bias."""
+    """Return the result for a log with outliers and missing samples, and the true gyro bias (3,) [rad/s]."""
     rng = np.random.default_rng(5)
     frame, drift = flight(rng)
     found = explore.identify(satellite(), synthetic.spoiled(frame, rng), validate=[flight(rng)[0]])
@@ -153,7 +159,7 @@ DISPERSED = {
 
 @pytest.fixture(scope="module")
 def disturbed():
-    """Return a log with a slow sinusoidal torque, whose phases are not those of the scenario."""
+    """Return a log (a data frame) with a slow sinusoidal torque, whose phases are not those of the scenario."""
     return flight(
         np.random.default_rng(7), disturbance=lambda t: TORQUE * np.sin(FREQUENCY * t + PHASES)
     )[0]  # fmt: skip
@@ -222,7 +228,11 @@ def test_a_wrong_model_does_not_reject_correct_readings_and_has_wide_intervals(d
 
 
 class ScriptedSearch(estimation.Search):
-    """A search of one phase with given results of the local searches."""
+    """A search of one phase with given results.
+
+    local: results of successive local searches. mirrored: results or exceptions of successive searches from a mirrored
+    phase. `tolerances` records the tolerances of the latter.
+    """
 
     def __init__(self, local, mirrored):
         problem: Any = SimpleNamespace(
@@ -249,7 +259,10 @@ class ScriptedSearch(estimation.Search):
 
 
 def local_result(phase, log_likelihood, noise=0.0, mean_square=1.0):
-    """Return the result of a local search that converged to this phase [rad]."""
+    """Return the result of a local search that converged to this phase [rad].
+
+    noise: acceleration noise of the filter [rad/s^1.5]. mean_square: of the innovations, relative to their variance.
+    """
     return estimation.SearchResult(np.array([phase]), log_likelihood, np.eye(1), mean_square, True, 1, noise)
 
 
@@ -298,7 +311,10 @@ class RuggedSearch(ScriptedSearch):
     """A search whose likelihood increases at every sixth evaluation only, without end."""
 
     def derivatives(self, z, logs, *, exact=True):
-        """Return a likelihood that increases at every sixth evaluation, and constant derivatives."""
+        """Return a likelihood that increases at every sixth evaluation, and constant derivatives.
+
+        Gradient (1,), information (1, 1) and mean square of the innovations are 1.
+        """
         self._evaluations += 1
         return float(self._evaluations) if self._evaluations % 6 == 1 else -1.0, np.ones(1), np.eye(1), 1.0
 

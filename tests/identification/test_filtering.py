@@ -17,7 +17,10 @@ NOISE, WALK = (2e-3, 5e-3), 0.02
 
 
 def chain(free, **identify):
-    """Return the scenario of a noisy double integrator with these free parameters of [identify]."""
+    """Return the scenario of a noisy double integrator.
+
+    free: parameters to estimate. identify: other keys of [identify].
+    """
     return scenario.from_tables(
         {
             "plant": {"kind": "chain", "order": 2, "x0": [1.0, 0.0]},
@@ -31,7 +34,10 @@ def chain(free, **identify):
 
 
 def chain_log(rows=60, bias=0.3, walk=0.0, scale=1.0):
-    """A log of a double integrator at irregular times with gaps, and its exact model."""
+    """Return a log (a data frame) of a double integrator at irregular times, and its columns t, u and y (rows, 2).
+
+    Some samples of y are missing (NaN). bias, walk: of the disturbance. scale: ratio of true to commanded input.
+    """
     rng = np.random.default_rng(3)
     dt = rng.uniform(0.03, 0.12, rows)
     t = np.cumsum(dt) - dt[0]
@@ -50,7 +56,7 @@ def chain_log(rows=60, bias=0.3, walk=0.0, scale=1.0):
 
 
 def prepared(loaded, frame):
-    """Return the estimation problem of a scenario and its log, prepared for the filter."""
+    """Return the estimation problem of a scenario and its log, and the log prepared for the filter."""
     log = telemetry.measurements(loaded, frame)
     problem = parameters.build(loaded, [log])
     return problem, estimation.prepare_log(problem, log)
@@ -228,7 +234,7 @@ def test_derivatives_without_those_of_the_covariance_are_good_enough_for_a_first
 
 
 def flexible_body():
-    """Return the problem of a spacecraft with two modes, and its log at rest with an interval of 0.1 ms."""
+    """Return the problem of a spacecraft with two modes, and its prepared log at rest with an interval of 0.1 ms."""
     loaded = scenario.from_tables({
         "spacecraft": {"inertia": [4.0, 5.0, 6.0]},
         "flexible": {"frequency": [3.0, 4.0], "damping": [0.01, 0.01], "coupling": [[0.7, 0.0, 0.2], [0.0, -0.4, 0.1]]},

@@ -20,7 +20,7 @@ RATE = np.stack([0.05 * np.sin(0.4 * T), 0.04 * np.cos(0.3 * T), 0.03 + 0.0 * T]
 
 
 def attitudes():
-    """Return attitudes (ROWS, 4), integrated from the body rate in fine steps."""
+    """Return attitudes (ROWS, 4), scalar last, at the times T, integrated from the body rate in fine steps."""
     turned = [Rotation.from_rotvec([0.1, -0.2, 0.3])]
     for k in range(ROWS - 1):
         fine = np.linspace(T[k], T[k + 1], 20)
@@ -36,7 +36,7 @@ Q = attitudes()
 
 
 def frame(**changes):
-    """Return a valid log; changes: columns to replace, or to remove if None."""
+    """Return a valid log as a data frame; changes: columns to replace, or to remove if None."""
     columns = {"t": T}
     columns |= {f"measured_q{k + 1}": Q[:, k] for k in range(4)}
     columns |= {f"measured_w{k + 1}": RATE[:, k] for k in range(3)}
@@ -45,14 +45,14 @@ def frame(**changes):
 
 
 def loaded(**table):
-    """Return a scenario with this [telemetry] table."""
+    """Return a scenario with this [telemetry] table, and with wheels if the table names their speed or torque."""
     wheels = {} if "wheel_speed" not in table and "wheel_torque" not in table else {"wheels": {"kind": "axes"}}
     sampled = {"loop": {"mode": "sampled"}, **wheels}
     return scenario.from_tables({**sampled, **({"telemetry": table} if table else {})})
 
 
 def with_value(column, row, value):
-    """Return the valid log with another value in one cell."""
+    """Return the valid log with another value in one cell; row: its number."""
     values = list(frame()[column])
     values[row] = value
     return frame(**{column: pl.Series(values, dtype=pl.String if isinstance(value, str) else pl.Float64, strict=False)})
@@ -164,7 +164,10 @@ def test_rates_of_a_long_log_of_a_spinning_spacecraft_fit_its_attitudes(unit, is
 
 
 def slow_log(noise, outliers):
-    """Return a log of a slow slew with `noise`, 1 sigma of the attitude [rad], and outliers of attitude and rate."""
+    """Return a log (a data frame) of a slow slew; noise: 1 sigma of the attitude [rad].
+
+    outliers: number of rows with a wrong attitude, and of other rows with a wrong rate.
+    """
     rng, t = np.random.default_rng(0), np.arange(400) / 2.0
     axis = np.array([0.01, 0.005, -0.003])
     angle, rate = 0.3 * t - 0.3 * np.sin(t / 10.0), 0.3 - 0.03 * np.cos(t / 10.0)

@@ -46,7 +46,7 @@ NOW = Sample(T, jnp.asarray(False), vector(0.1))
 
 
 def surface(law, v, v_dot):
-    """Return the sliding variable for an error and its rate."""
+    """Return the sliding variable s (m,) of a law for an error v (m,) and its rate."""
     return law.acceleration(NOW, v, v_dot, vector(0.0))[1]
 
 
@@ -81,7 +81,10 @@ def test_sliding_variable_obeys_the_reaching_law_of_its_paper(name, trial):
 
 
 def simulate_rotation(law, angle, rate, t_end, period=0.005):
-    """Return times and the error v_3 of a body that rotates about its z axis without a disturbance."""
+    """Return times and errors v_3, both (samples,), of a body that rotates about its z axis without a disturbance.
+
+    angle, rate: at t = 0 [rad, rad/s]. t_end, period [s].
+    """
     q = Rotation.from_rotvec([0.0, 0.0, angle]).as_quat()
     body = rigid_body.spacecraft((10.0, 12.0, 14.0))
     law = replace(law, kinematics=MultiplicativeKinematics(body), t_f=vector(t_end - 1.0), delta=vector(period))
@@ -92,7 +95,7 @@ def simulate_rotation(law, angle, rate, t_end, period=0.005):
 
 
 def sliding_rate(name, v):
-    """Return v' on the surface s = 0."""
+    """Return v' on the surface s = 0 for v > 0; name: of the law."""
     return -((0.6 * v) ** (1 / 1.3)) if name == "terminal" else -(0.3 * v**2.0 + 0.5 * v**0.8)
 
 

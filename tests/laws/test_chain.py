@@ -128,7 +128,7 @@ def test_simulated_continuous_chain_equals_its_exact_solution(n, t_f):
 
 @jax.jit
 def exact_chain_motion(run, t):
-    """Return the exact motion of a chain without disturbance at times (times,) before t_f."""
+    """Return the exact `ChainMotion` of a chain without disturbance at times t (times,) before t_f."""
     law = run.controller
     return jax.vmap(lambda time: solutions.exact_chain(time, law.t_f, law.eta, run.initial))(t)
 
@@ -181,7 +181,8 @@ SURFACES = {2: lambda z: [1.0], 3: lambda z: [1.0, 2 * z], 4: lambda z: [1.0, 1 
 def check_envelopes(n, case):
     """Check that |s| and all states are inside the corrected envelopes, for disturbances up to K.
 
-    The boundary layer is as thin as 800 steps can resolve.
+    n: order of the chain. case: random values of gains, states and disturbance by name. The boundary layer is as thin
+    as 800 steps can resolve.
     """
     t_f, bound = case["t_f"], case["bound"]
     # the rate tau^(n-1) K / width of the boundary layer times the largest step is below 1.2
@@ -215,7 +216,10 @@ test_many_chains_are_inside_their_envelopes = pytest.mark.long(
 
 @jax.jit
 def envelope(run, t, s0, floor):
-    """Return centre and half width of the envelopes of all states at times t, from constants of the envelope of s."""
+    """Return centre and half width (times, n) of the envelopes of all states at times t.
+
+    s0, floor: constants of the envelope of s.
+    """
     law = run.controller
     return jax.vmap(lambda time: solutions.state_envelope(time, law.t_f, law.eta, run.initial, s0, floor))(t)
 

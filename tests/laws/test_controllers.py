@@ -174,7 +174,10 @@ def slew(kinematics, reference, start, rate=(0.0, 0.0, 0.0), undisturbed=True, *
 
 
 def fixed(q):
-    """Return a reference at rest, of the type of rotating ones, so that both use one compiled program."""
+    """Return a reference at rest with attitude q (4,).
+
+    It has the type of rotating references, so that both use one compiled program.
+    """
     return references.Spin(vector(q), jnp.zeros(3))
 
 

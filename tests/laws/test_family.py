@@ -52,14 +52,17 @@ APPROACH = jnp.asarray(False)  # value of `Sample.hold`
 
 
 def build_law(name, error: Any = ChainKinematics, model: Any = CHAIN, t_f=T_F, delta=DELTA, **changes) -> Any:
-    """Return a law by its name in scenario files, with the gains above."""
+    """Return a law by its name in scenario files, with the gains above.
+
+    error, model: classes of its error and its design model. changes: other values of its gains.
+    """
     gains = {key: vector(value) for key, value in {**GAINS[name], **changes}.items()}
     return CLASSES[name](kinematics=error(model), t_f=vector(t_f), delta=vector(delta), **gains)
 
 
 @jax.jit
 def evaluate(law, memory, now, error, rate, bound):
-    """Return acceleration, sliding variable and the next memory of a law."""
+    """Return acceleration, sliding variable and the next memory of a law; bound: on the disturbance."""
     a, s, *memories = law.acceleration(now._replace(memory=memory), error, rate, bound)
     return a, s, memories[0] if memories else memory
 
@@ -68,12 +71,12 @@ def evaluate(law, memory, now, error, rate, bound):
 
 
 def sig(x, power):
-    """Return sign(x) |x|^power."""
+    """Return sign(x) |x|^power for each element."""
     return np.sign(x) * np.abs(x) ** power
 
 
 def powers_of(x):
-    """Return 1, x .. x^5 and their first two derivatives, one in each row."""
+    """Return (3, 6): the first row is 1, x .. x^5, the other rows are its first and second derivatives."""
     return np.array([[math.perm(k, n) * x ** max(k - n, 0) for k in range(6)] for n in range(3)])
 
 
@@ -81,7 +84,10 @@ ENDS = np.concatenate([powers_of(0.0), powers_of(1.0)])
 
 
 def quintic(start, rate, t, t_f=T_F):
-    """Return value, rate and acceleration at t of the quintic with this start that is at rest at zero at t_f."""
+    """Return value, rate and acceleration at t of the quintic with this start that is at rest at zero at t_f.
+
+    start, rate, and each result: (m,). After t_f, all results are zero.
+    """
     if t >= t_f:
         return 0.0 * start, 0.0 * start, 0.0 * start
     coefficients = np.linalg.solve(ENDS, np.stack([start, t_f * rate, *(0.0 * start for _ in range(4))]))
@@ -89,7 +95,7 @@ def quintic(start, rate, t, t_f=T_F):
 
 
 def phi(x, q, settling):
-    """Return Phi of the predefined-time law. From any start, x' = -Phi(x) reaches 0 within `settling`."""
+    """Return Phi of the predefined-time law. From any start, x' = -Phi(x) reaches 0 within `settling` [s]."""
     return np.pi / (2.0 * q * settling) * (sig(x, 1.0 + q) + sig(x, 1.0 - q))
 
 
@@ -99,7 +105,11 @@ def phi_derivative(x, q, settling):
 
 
 def law_in_numpy(name, gains, now, e, w, bound, memory=None, profile=None):
-    """Return acceleration, sliding variable and next memory of a law. now: time, hold, length of the period."""
+    """Return acceleration, sliding variable and next memory of a law.
+
+    name, gains: of the law. now: time, whether in the hold phase, length of the period. e, w: error and its rate.
+    bound: on the disturbance. profile: value, rate and acceleration of the time base, by default `quintic`.
+    """
     (t, hold, dt), g = now, gains
 
     def sign(s):
@@ -169,7 +179,7 @@ PLANTS: dict[str, Any] = {
 
 @jax.jit
 def error_of_plant(law, reference, t, x, u, d):
-    """Return eps, eps' (directly and by differentiation) and eps'' of the plant with this input and disturbance."""
+    """Return eps, eps', eps' by differentiation, and eps'' of the plant with this input and disturbance."""
     motion = law.model.rate(t, x, u, d)
 
     def at(passed):  # after a small time, to first order for the plant
@@ -180,7 +190,10 @@ def error_of_plant(law, reference, t, x, u, d):
 
 
 def independent_error(plant, x, d):
-    """Return eps and eps' without the code under test, and the largest change of eps'' by a disturbance of norm K2."""
+    """Return eps (m,) and eps' (m,) without the code under test, and a bound on the effect of d.
+
+    The bound is the largest change of |eps''| by a disturbance of norm K2.
+    """
     if plant == "chain":
         return np.array(x[:1]), np.array(x[1:]), K2
     if plant == "arm":
@@ -195,7 +208,10 @@ def independent_error(plant, x, d):
 
 
 def attitude_profile(start, rate, t, h=5e-3):
-    """Return v of the rotation by the quintic rotation vector, v' and v'' by finite differences of order 4."""
+    """Return v, v' and v'', (3,) each, of the rotation by the quintic rotation vector.
+
+    The derivatives are finite differences of order 4 with the step h [s].
+    """
     at = [Rotation.from_rotvec(quintic(start, rate, t + k * h)[0]).as_quat()[:3] for k in (-2, -1, 0, 1, 2)]
     first = (at[0] - 8 * at[1] + 8 * at[3] - at[4]) / (12 * h)
     return at[2], first, (-at[0] + 16 * at[1] - 30 * at[2] + 16 * at[3] - at[4]) / (12 * h**2)
@@ -280,9 +296,9 @@ def test_values_and_gradients_of_laws_are_finite_at_zero_norms_roots_and_remaini
 
 
 def chain_run(law, x0, period=0.01, noise=0.0, disturbance=(0.0, 1.0, 0.0, 0.0), bound=0.0) -> Any:
-    """Return the parts of a sampled chain.
+    """Return the parts of a sampled chain under this law.
 
-    disturbance: amplitude, frequency, phase and bias.
+    disturbance: amplitude, frequency, phase and bias. noise: 1 sigma of both states.
     """
     a, w, p, b = (vector([v]) for v in disturbance)
     run = helpers.chain_parts(x0, T_F, delta=DELTA, period=period, noise=(noise, noise), bound=bound,
@@ -292,7 +308,7 @@ def chain_run(law, x0, period=0.01, noise=0.0, disturbance=(0.0, 1.0, 0.0, 0.0),
 
 
 def simulate(run, trial=0, status=rollout.OK) -> Any:
-    """Return the history of a run, without the periods of no length."""
+    """Return the history of a run as NumPy arrays, without the periods of no length; status: the expected one."""
     found = rollout.simulate_parts(run, trial=np.uint32(trial), record=True)
     assert found.status == status
     log = jax.tree.map(np.asarray, found.log)
@@ -300,7 +316,10 @@ def simulate(run, trial=0, status=rollout.OK) -> Any:
 
 
 def simulate_in_numpy(name, law, x0, times, disturbance=(0.0, 1.0, 0.0, 0.0), bound=0.0):
-    """Return states of the chain at these times, and commands, by `law_in_numpy` and the closed-form motion."""
+    """Return states (times, 2) and commands (times - 1, 1) of the chain, by `law_in_numpy` and the closed-form motion.
+
+    name, law: of the same law. disturbance: amplitude, frequency, phase and bias.
+    """
     gains = {key: float(getattr(law, key)) for key in GAINS[name]}
     amplitude, w, phase, bias = disturbance
     x, memory, states, commands = np.array(x0, dtype=float), None, [], []
@@ -443,7 +462,11 @@ def test_body_at_rest_rotates_about_its_eigenaxis_by_the_quintic():
 
 
 def closed_loop(law, start, t_end, d=0.0, event=None, bound=0.0):
-    """Integrate a double integrator under the law in continuous time. event: stop when s becomes zero."""
+    """Integrate a double integrator under the law in continuous time; return SciPy's solution.
+
+    start: error and rate. d: constant disturbance. event: whether to stop when s becomes zero; otherwise the solution
+    is dense.
+    """
     memory, bound = law.begin(), vector(bound)
     approach: Any = np.array(False)  # NumPy arrays have the smallest call overhead
     period: Any = np.array(0.1)

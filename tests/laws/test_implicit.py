@@ -25,7 +25,10 @@ X0 = {2: [1.0, 0.3], 3: [1.0, 0.3, -0.2]}
 
 
 def chain_parts(order=2, bound=0.0, disturbance=0.0, x0=None, clock="anchored", **controller):
-    """Return the parts of a sampled chain with a constant disturbance and its known bound."""
+    """Return the parts of a sampled chain with a constant disturbance and its known bound.
+
+    controller: other keys of its table.
+    """
     law = {
         "t_f": T_F,
         "eta": order + 0.7,
@@ -44,7 +47,7 @@ def chain_parts(order=2, bound=0.0, disturbance=0.0, x0=None, clock="anchored", 
 
 
 def simulate(parts):
-    """Return times, states, s and inputs at the samples."""
+    """Return times (samples,), states (samples, n), s and inputs, (samples,) each, at the samples."""
     log = fly(parts).log
     return tuple(v[log.has_length][:-1] for v in (log.t, log.x, log.s[:, 0], log.u[:, 0]))
 
@@ -120,7 +123,10 @@ def test_derivatives_of_the_window_error_equal_finite_differences(order):
 
 @jax.jit
 def _value_and_derivative(parts, at, along):
-    """Return the window error and its derivative along a direction of eta, delta, k1 and t_f."""
+    """Return the window error and its derivative along a direction of the gains.
+
+    at, along: values and direction of eta, delta, k1 and t_f.
+    """
 
     def error(at):
         moved = with_gains(parts, dict(zip(("eta", "delta", "k1", "t_f"), at, strict=True)))

@@ -21,7 +21,7 @@ multiply_all = jax.jit(jax.vmap(attitude.multiply))
 
 
 def skew(v):
-    """Return the cross-product matrix of a vector."""
+    """Return the cross-product matrix (3, 3) of a vector."""
     return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
 
 
@@ -117,7 +117,10 @@ def test_vector_rates_equal_automatic_derivatives_of_a_moving_attitude():
 
 
 def series(r):
-    """Return sin(|r|/2)/|r| and cos(|r|/2), and their derivatives in |r|^2, by exact Taylor series in |r|^2."""
+    """Return [f, g] and their derivatives in |r|^2 [f', g'], with f = sin(|r|/2)/|r| and g = cos(|r|/2).
+
+    All are exact Taylor series in |r|^2.
+    """
     square = math.fsum(x * x for x in r)
     terms = [((-1) ** k / 2 ** (2 * k + 1) / math.factorial(2 * k + 1), (-1) ** k / 4**k / math.factorial(2 * k))
              for k in range(30)]  # fmt: skip

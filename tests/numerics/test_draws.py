@@ -18,7 +18,7 @@ from tests.tree import modules
 
 
 def threefry(key, counter):
-    """Return the two output words of Threefry-2x32 with 20 rounds."""
+    """Return the two output words of Threefry-2x32 with 20 rounds; key, counter: two words each."""
     mask, turns = 0xFFFFFFFF, (13, 15, 26, 6, 17, 29, 16, 24)
     parity = 0x1BD11BDA ^ key[0] ^ key[1]
     schedule = [key[0], key[1], parity]
@@ -33,7 +33,7 @@ def threefry(key, counter):
 
 
 def expected(seed, trial, name, sample, count):
-    """Return `count` uniform and normal numbers of a stream by the documented rule."""
+    """Return two lists of `count` uniform and normal numbers of a stream by the documented rule."""
     key = threefry((seed, 0), (trial, zlib.crc32(name.encode())))
     pairs = [threefry(key, (sample % 2**32, block)) for block in range(-(-count // 2))]
     uniforms, normals = [], []
@@ -45,7 +45,7 @@ def expected(seed, trial, name, sample, count):
 
 
 def words(*values):
-    """Return the values as unsigned 32-bit numbers of JAX."""
+    """Return a list of JAX uint32 scalars."""
     return [jnp.uint32(value) for value in values]
 
 
@@ -157,7 +157,10 @@ def stream_names():
 
 
 def module_stream_names(module, path):
-    """Return the names of random streams in the calls of `draws` in one module, with the values of its constants."""
+    """Return a list of the names of random streams in the calls of `draws` in one module.
+
+    Names of constants are replaced by their values. path: of the module's file.
+    """
     source, names = path.read_text(), []
     if "draws." not in source:
         return names

@@ -52,7 +52,7 @@ def test_classes_with_the_same_fields_have_different_tree_structures():
 
 
 class _State(NamedTuple):
-    """Attitude and body rate."""
+    """Attitude q and body rate w."""
 
     q: Any
     w: Any
@@ -176,13 +176,13 @@ def test_select_ignores_the_tangent_of_the_other_value():
 
 
 def convergence_orders(errors):
-    """Return the orders of convergence, from errors of step sizes that are halved each time."""
+    """Return the orders of convergence (n - 1,), from n errors of step sizes that are halved each time."""
     return np.log2(np.asarray(errors)[:-1] / np.asarray(errors)[1:])
 
 
 @partial(jax.jit, static_argnames=("step", "count"))
 def integrate(step, y, end, count):
-    """Integrate from t = 0 to `end` in `count` steps and return the last state."""
+    """Integrate from t = 0 to `end` in `count` steps and return the last state; step: of (t, y, dt)."""
 
     def advance(y, k):
         return step(k * (end / count), y, end / count), None
@@ -226,7 +226,10 @@ def test_rk4_converges_with_order_4():
 
 
 def phi_exact(x, order, differentiate=False):
-    """Return phi_k of a number for k = order, or its derivative, with 100 digits: phi_k' = (phi_(k-1)' - phi_k) / x."""
+    """Return phi_k of a number for k = order, or its derivative, with 100 digits rounded to a float.
+
+    The recursion is phi_k' = (phi_(k-1)' - phi_k) / x.
+    """
     if x == 0.0:
         return 1 / math.factorial(order + differentiate)
     with localcontext() as context:
@@ -240,7 +243,7 @@ def phi_exact(x, order, differentiate=False):
 
 
 def phi_series(x, order):
-    """Return phi_k of a matrix, the sum of x^j / (j + k)!, in exact integer arithmetic."""
+    """Return phi_k of a matrix for k = order, the sum of x^j / (j + k)!, in exact integer arithmetic."""
     exact = np.array([[Fraction(float(v)) for v in row] for row in x])
     unit = max(v.denominator for v in exact.flat)  # a power of two
     whole = np.array([[int(v * unit) for v in row] for row in exact], object)
@@ -298,7 +301,7 @@ def test_phi_functions_of_general_matrices_are_accurate(size):
 
 
 def phi_entries(rate):
-    """Return phi_0 to phi_3 (4,) of the number -rate, computed with a matrix."""
+    """Return phi_0 to phi_3 (4,) of -rate by the tested `phi_functions`: entry [0, 0] for the matrix -rate I."""
     return jnp.stack([phi[0, 0] for phi in integrators.phi_functions(-rate * jnp.eye(2), 3)])
 
 
@@ -365,12 +368,15 @@ decay = jax.jit(integrators.decay)
 
 @jax.jit
 def step_with_constant_forcing(linear, m, g, dt):
-    """Return y and m after an ETDRK4 step with the constant forcing g."""
+    """Return y and m after an ETDRK4 step with the constant forcing g; linear: coefficients of the step dt."""
     return integrators.etdrk4(lambda t, y, m: (jnp.zeros(1), g, None), linear, jnp.zeros(()), jnp.zeros(1), m, dt)[:2]
 
 
 def step_with_cosine_forcing(t, y, dt):
-    """Return y and m after an ETDRK4 step with the forcing cos t; the coefficients are part of the state."""
+    """Return (y, m, linear) after an ETDRK4 step with the forcing cos t.
+
+    y: the same three values before the step. The coefficients `linear` do not change.
+    """
     y, m, linear = y
     step = integrators.etdrk4(lambda t, y, m: (jnp.zeros(1), jnp.cos(t)[None], None), linear, t, y, m, dt)
     return *step[:2], linear
@@ -409,7 +415,7 @@ def test_etdrk4_returns_the_auxiliary_output_of_its_first_stage():
 @jax.jit
 @partial(jax.grad, argnums=(0, 1))
 def step_derivatives(rate, dt):
-    """Return the derivatives of an ETDRK4 step by decay rate and step length."""
+    """Return the derivatives of the first component after an ETDRK4 step, by decay rate and step length."""
     linear = integrators.decay(rate * jnp.eye(2), dt)
     return integrators.etdrk4(
         lambda t, y, m: (m, vector([0.3, -0.4]), None), linear, vector(0.0), jnp.zeros(2), vector([1.0, 2.0]), dt

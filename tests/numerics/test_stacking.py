@@ -17,7 +17,10 @@ OUTER = {"state": (X0, jnp.asarray(0.5))}
 
 
 def pendulum(carry, t):
-    """Return the next state of a pendulum, with outputs of several dtypes and shapes, None and an empty array."""
+    """Return the next state of a pendulum, and its outputs.
+
+    The outputs have several dtypes and shapes, None and an empty array. carry: {"state": (x, v)}.
+    """
     x, v = carry["state"]
     v = v - 0.1 * jnp.sin(x[0]) + 0.01 * t
     count = t.astype(jnp.int32)
@@ -59,7 +62,7 @@ def test_stacking_scan_falls_back_to_lax_scan_if_jit_is_disabled():
 
 
 def gradients_of(scan):
-    """Return derivatives and batched values (9,) of a function that uses this scan."""
+    """Return derivatives and batched values (9,) of a function that uses this scan; scan: like `jax.lax.scan`."""
 
     def error(gain):
         (_, (outputs, *_)) = scan(lambda c, t: pendulum(c, gain * t), OUTER, TIMES)
@@ -76,7 +79,7 @@ def test_stacking_scan_composes_with_grad_jacfwd_and_vmap():
 
 
 def output_dtypes(trace):
-    """Yield the dtypes of the output arrays of each scan in a trace."""
+    """Yield, for each scan in a trace, the list of the dtypes of its output arrays."""
     for eqn in equations(trace):
         if eqn.primitive.name == "scan":
             _, carried, _ = split_scan_operands(eqn.params, eqn.invars)

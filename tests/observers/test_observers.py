@@ -28,12 +28,15 @@ def test_update_matrix_of_the_digital_observer_equals_its_closed_form(dt):
 
 
 def body_state(w):
-    """Return a state at the identity attitude with the body rate w [rad/s]."""
+    """Return a state at the identity attitude with the body rate w (3,) [rad/s]."""
     return rigid_body.AttitudeState(vector(0.0, 0.0, 0.0, 1.0), vector(w))
 
 
 def held_motion(inertia, torque, seconds, steps=2000):
-    """Return the rates at both ends of a period with constant torque, by RK4 in NumPy with many steps."""
+    """Return the body rates at both ends of a period with constant torque, by RK4 in NumPy with many steps.
+
+    seconds: length of the period. The rate at its start is fixed.
+    """
     inverse = np.linalg.inv(inertia)
     w = np.array([0.05, -0.1, 0.08])
     start, h = w, seconds / steps
@@ -96,7 +99,10 @@ def test_bound_on_the_estimation_error_equals_the_corrected_equation_55():
 
 
 def worst_error(a, sign_pattern, c, seconds):
-    """Return the exact estimation error for constant d' = +-c with this sign pattern: A^-1 (I - E) c."""
+    """Return the exact estimation error (3,) for constant d' = +-c with this sign pattern (3,): A^-1 (I - E) c.
+
+    a: the decay matrix A. seconds: time t since an error of zero; E is e^(-A t).
+    """
     return np.linalg.solve(a, (np.eye(3) - expm(-a * seconds)) @ (c * sign_pattern))
 
 

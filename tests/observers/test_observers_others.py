@@ -33,7 +33,10 @@ def finite_time_observer(model: base.Plant = MASS, gain=1.0, c=0.0, start=0.0, w
 
 
 def remaining_fraction(t, gain=GAIN, mu=MU):
-    """Return e(t) / e(0) for a constant disturbance: e^(-l t) rho^mu, where rho is constant after T_o - delta_o."""
+    """Return e(t) / e(0) for a constant disturbance: e^(-l t) rho^mu.
+
+    Here rho is (T_o - t) / T_o, which is constant after T_o - delta_o.
+    """
     return np.exp(-gain * t) * (max(T_O - t, DELTA_O) / T_O) ** mu
 
 
@@ -71,7 +74,7 @@ def test_observer_update_over_a_period_of_length_zero_has_finite_derivatives():
 
 
 def simulate_continuous(observer, disturbance, t_f=6.0, steps=400):
-    """Return the history of a chain with this observer in the continuous loop."""
+    """Return the history of a chain with this observer in the continuous loop; steps: before and after t_s each."""
     run = chain_parts([0.3, 0.0], t_f, 3.0, 0.1, observer=observer, disturbance=disturbance, bound=0.0)
     nodes = vector(observer.nodes())
     timing = replace(run.clock, saves=nodes, before=steps, after=steps, max_step=vector(3.0 * t_f / steps))
@@ -110,7 +113,10 @@ def test_prescribed_time_bound_is_between_1_and_2_times_the_worst_error(gain):
 
 
 def super_twisting(gain, d, seconds, start=0.0):
-    """Return times and errors d_hat - d of the observer with a discontinuous sign, integrated by SciPy."""
+    """Return times and errors d_hat - d of the observer with a discontinuous sign, integrated by SciPy.
+
+    d: the disturbance as a function of time. start: d_hat at t = 0.
+    """
     width = 1e-9
 
     def rate(t, y):
