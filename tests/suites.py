@@ -13,7 +13,7 @@ NOISES = [(8.0, 8.0, 40.0), (12.0, 10.0, 60.0)]  # [arcsec]
 
 
 def star_tracker(k, interval, latency, period):
-    """Return star tracker 0 or 1; sample interval, latency and control period [s]."""
+    """Return star tracker k, 0 or 1, of the tests; sample interval, latency and control period [s]."""
     mounting = attitude.from_rotation_vector(vector(MOUNTINGS[k]))
     times = attitude_sensors.sample_times(interval, latency, period)
     noise = ARCSEC * jnp.asarray(NOISES[k])
@@ -21,7 +21,10 @@ def star_tracker(k, interval, latency, period):
 
 
 def suite(sensors, period, gyro=(1e-5, 2e-5, 1e-5), bias=1e-4, walk=1e-7):
-    """Return a suite of attitude sensors and a gyro; walk: random walk of the gyro bias [rad/s/sqrt(s)]."""
+    """Return a suite of attitude sensors and a gyro.
+
+    gyro: 1 sigma [rad/s]. bias: 1 sigma of its bias [rad/s]. walk: random walk of its bias [rad/s/sqrt(s)].
+    """
     drift = jnp.full(3, walk / np.sqrt(period))
     found = kalman_filter.kalman_filter(sensors, gyro, drift, bias, period)
     return sensor_suite.SensorSuite(

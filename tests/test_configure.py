@@ -251,7 +251,7 @@ print(json.dumps(told))
 
 @pytest.fixture(scope="module")
 def told(tmp_path_factory):
-    """Return the results of a process that calls `configure` several times, before and after JAX has run."""
+    """Return the results, a dict, of a process that calls `configure` several times, before and after JAX has run."""
     environment = {name: value for name, value in os.environ.items() if name != "TF_CPP_MIN_LOG_LEVEL"}
     environment["JAX_NUMPY_DTYPE_PROMOTION"] = "strict"  # a setting for the user's code, not for stored programs
     cache = tmp_path_factory.mktemp("cache")

@@ -227,7 +227,8 @@ def test_every_kind_of_law_observer_reference_and_disturbance_is_in_a_tested_sce
 def batch(parts, still, dispersion, in_lanes, sloped):
     """Return metrics, statuses and failure times of some trials, and derivatives of the metrics along all gains.
 
-    The last trial has the initial state and boundary layer of `still`.
+    The last trial has the initial state and boundary layer of `still`. in_lanes: lanes or JAX. sloped: whether to
+    return derivatives; otherwise they are an empty dict.
     """
     vmap = lanes.vmap if in_lanes else jax.vmap  # pytest raises the warning of a primitive without a rule
     names = [name for name in parts.controller.tunable if name not in ("sign_width", "t_f", "k1")]
@@ -267,7 +268,10 @@ def at_rest_on_the_target(parts):
 
 
 def agree(values, wanted, unit, name, skip=()):
-    """Assert that metrics (trials,) agree by name, within `unit` times the largest value of each."""
+    """Assert that metrics, {name: (trials,)}, agree within `unit` times the largest value of each.
+
+    name: of the case, for the message. skip: metrics that may differ.
+    """
     for metric in wanted:
         a, b = np.asarray(values[metric]), np.asarray(wanted[metric])
         np.testing.assert_array_equal(np.isfinite(a), np.isfinite(b), err_msg=metric)
@@ -277,7 +281,10 @@ def agree(values, wanted, unit, name, skip=()):
 
 
 def one_by_one(parts, still, dispersion, sloped):
-    """Return the results of `batch` from single simulations, without gradients. They compile in half the time."""
+    """Return the results of `batch` from single simulations, without derivatives.
+
+    These programs compile in half the time.
+    """
     assert not sloped
     begun = [drawn(dispersion, parts, trial) for trial in (*NUMBERS, np.uint32(NUMBERS.size))]
     begun[-1] = replace(begun[-1], initial=still.initial)
@@ -298,7 +305,8 @@ under_vmap = partial(batch, in_lanes=False)
 def compare(parts, dispersion, name, sloped, reference: Any = under_vmap):
     """Assert that lanes and a reference give equal results of all trials; the last trial is at rest on the target.
 
-    Returns metrics of the other trials, and status, metrics and gradients of the last trial, all from the reference.
+    The function returns metrics of the other trials, and (status, metrics, derivatives) of the last trial, all from the
+    reference. name: of the case. reference: like `batch`.
     """
     still, by_lanes = at_rest_on_the_target(parts), partial(batch, in_lanes=True)
     both = [jax.tree.map(np.asarray, of(parts, still, dispersion, sloped=sloped)) for of in (by_lanes, reference)]

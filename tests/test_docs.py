@@ -36,12 +36,12 @@ FENCE = re.compile(r"^( *)```(\w*)\n(.*?)^\1```", re.M | re.S)
 
 
 def blocks(path, *languages):
-    """Return the code blocks of a page in one of these languages."""
+    """Return a list of the code blocks of a page in one of these languages; path: of the page."""
     return [textwrap.dedent(block) for _, language, block in FENCE.findall(path.read_text()) if language in languages]
 
 
 def commands():
-    """Return the options of each command, by its name."""
+    """Return {command: set of its options}, such as "--out", of all commands."""
     found, command = {}, ""
     for line in app.generate_docs(output_format="markdown", usage_name="ptsmc").splitlines():
         if line.startswith("## ptsmc "):

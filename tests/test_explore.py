@@ -26,7 +26,7 @@ TABLES, CHAIN = untuned(SHORT), untuned(SHORT_CHAIN)
 
 @pytest.fixture(scope="module")
 def flight():
-    """Return the simulated run of trial 7 of a short spacecraft scenario."""
+    """Return the result of `ptsmc_jax.simulate` of trial 7 of a short spacecraft scenario."""
     return ptsmc_jax.simulate(scenario.from_tables(TABLES), seed=3, trial=7)
 
 

@@ -26,19 +26,22 @@ X = np.linspace(0.0, 1.0, 5)
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """Return the folder for stored programs, which the first stored program creates."""
+    """Return the path of the folder for stored programs, which the first stored program creates."""
     monkeypatch.setattr(configure, "programs", tmp_path / "programs")
     return tmp_path / "programs"
 
 
 def ours(function, name="ours"):
-    """Make a function look like a function at the top of a module of the project."""
+    """Make a function look like a function at the top of a module of the project; return it."""
     function.__module__, function.__qualname__, function.__name__ = "ptsmc_jax.numerics.attitude", name, name
     return function
 
 
 def spied(name="spied", factor=2.0):
-    """Return a program, as a new process would make it of the same function, and the list of threads that traced it."""
+    """Return a program, as a new process would make it of the same function, and a list.
+
+    The list receives the thread of each trace of the program. Programs with the same `name` and `factor` are equal.
+    """
     traced = []
 
     def function(x, y=1.0, kind="plain", points=2):

@@ -14,7 +14,7 @@ QUICKLY = (
 
 @cache
 def modules(*packages: str) -> dict[str, Path]:
-    """Return files by the dotted names of their modules, `__init__` of packages included."""
+    """Return {dotted name: path} of all modules, `__init__` of packages included; packages: by default `PACKAGES`."""
     found = {}
     for package in packages or PACKAGES:
         for path in sorted((ROOT / package).rglob("*.py")):

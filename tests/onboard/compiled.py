@@ -32,7 +32,10 @@ typedef double real;
 
 
 def body(function, *args):
-    """The C statements of a function of arrays, and the printer that wrote them."""
+    """Return the C statements of a function of arrays as a list of lines, and the printer that wrote them.
+
+    args: arrays with the shapes and types of its arguments.
+    """
     closed = jax.make_jaxpr(function)(*args)
     pool, given, at = Pool(), [], 0
     for arg in args:
@@ -49,7 +52,7 @@ def body(function, *args):
 
 
 def source(function, *args):
-    """The text of a C program that computes a function."""
+    """Return the text of a C program that computes a function of arrays: run(in, out) with flat doubles."""
     lines, _ = body(function, *args)
     text = "\n".join(lines)
     helpers = "\n".join(code for name, code in templates.HELPERS.items() if f"{name}(" in text)
@@ -58,7 +61,10 @@ def source(function, *args):
 
 
 def library(folder, text, *options):
-    """A shared library, compiled from the text of a C program."""
+    """Return a shared library as a `ctypes.CDLL`, compiled in the folder from the text of a C program.
+
+    options: of the compiler.
+    """
     path = folder / "run.c"
     path.write_text(text)
     flags = [*STRICT, "-O1", "-shared", "-fPIC", *options, str(path), "-o", str(folder / "run.so"), "-lm"]
@@ -68,7 +74,7 @@ def library(folder, text, *options):
 
 
 def both(folder, function, *args):
-    """Outputs of a function in C and in JAX, as flat arrays."""
+    """Return the outputs of a function in C and in JAX, as two flat arrays; args: the arguments."""
     expected = np.concatenate(
         [np.ravel(np.asarray(v, dtype=float)) for v in jax.tree.leaves(function(*map(jnp.asarray, args)))]
     )
@@ -80,14 +86,20 @@ def both(folder, function, *args):
 
 
 def program(tables, place):
-    """Write the controller of a scenario, without test vectors."""
+    """Write the controller of a scenario into the folder `place`, without test vectors; return the `folder.Controller`.
+
+    tables: of the scenario.
+    """
     made = folder.Controller(scenario.reading.complete(scenario.from_tables(tables)), "flight", "a scenario")
     store.write_folder(place, lambda making: folder.write_program(making, made))
     return made
 
 
 def step_many(library, state, inputs, parameters: Any = np.nan, function="ptsmc_many"):
-    """New states, outputs and statuses of a compiled controller for rows (.., columns); NaN selects its parameters."""
+    """Return new states, outputs and statuses of a compiled controller for rows (.., columns) of state and inputs.
+
+    parameters: NaN selects the parameters of the library. function: the C function that is called.
+    """
     shape, columns = np.shape(state)[:-1], library.columns
     state, inputs = (
         np.ascontiguousarray(v, dtype=float).reshape(*shape, len(columns[kind]))  # C reads doubles
@@ -102,7 +114,10 @@ def step_many(library, state, inputs, parameters: Any = np.nan, function="ptsmc_
 
 
 def replayed(library, samples, state, **options):
-    """Statuses, outputs and states of a compiled controller for a sequence of samples."""
+    """Return statuses (samples,), outputs and states (samples, columns) of a compiled controller.
+
+    samples: rows of inputs (samples, columns). state: before the first sample. options: of `step_many`.
+    """
     statuses, outputs, states = [], [], []
     for row in samples:
         state, out, status = step_many(library, state, row, **options)

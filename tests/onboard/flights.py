@@ -18,7 +18,7 @@ PENDULUM = f"{ROOT / 'scenarios' / 'two_link_arm.py'}:arm"
 
 
 def flight(**tables: Any) -> dict[str, Any]:
-    """Tables of a short scenario without filter, changed by these tables."""
+    """Return the tables of a short scenario without filter. Keys of `tables` are added or replace its keys."""
     found: dict[str, Any] = {"loop": LOOP, "controller": LAW, "hardware": NOISE, "dispersion": SPREAD}
     for name, table in tables.items():
         found[name] = {**found.get(name, {}), **table} if isinstance(table, dict) and name != "observer" else table

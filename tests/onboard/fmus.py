@@ -8,7 +8,10 @@ from fmpy.fmi3 import FMU3Slave
 
 
 class Unit:
-    """An FMU that FMPy has loaded. Its variables are read and written by name."""
+    """An FMU that FMPy has loaded from a file. Its variables are read and written by name.
+
+    `unit` is its first instance, which all methods use by default; `period` is its step [s].
+    """
 
     def __init__(self, file):
         self.described = fmpy.read_model_description(str(file))
@@ -28,26 +31,29 @@ class Unit:
         return made
 
     def _of_type(self, names, prefix, unit):
-        """Return the names grouped by type, each group with the function of `unit` that reads or writes it."""
+        """Return [(`unit.getFloat64` or the like, the names of variables of that type), ..].
+
+        prefix: "get" or "set". unit: an instance of the FMU.
+        """
         groups = {}
         for name in names:
             groups.setdefault(self.of[name].type, []).append(name)
         return [(getattr(unit, f"{prefix}{kind}"), found) for kind, found in groups.items()]
 
     def write(self, values, unit=None):
-        """Set variables."""
+        """Set variables; values: a dict by name. unit: an instance, by default the first one."""
         for function, names in self._of_type(values, "set", unit or self.unit):
             function([self.of[name].valueReference for name in names], [values[name] for name in names])
 
     def read(self, names, unit=None):
-        """Values of variables by name."""
+        """Return the values of variables as a dict by name; unit: an instance, by default the first one."""
         found = {}
         for function, some in self._of_type(names, "get", unit or self.unit):
             found |= dict(zip(some, function([self.of[name].valueReference for name in some]), strict=True))
         return {name: found[name] for name in names}
 
     def begin(self, values=(), unit=None):
-        """Initialise an instance with these start values."""
+        """Initialise an instance; values: start values by name. unit: an instance, by default the first one."""
         unit = unit or self.unit
         if self.three:
             self.write(dict(values), unit)
@@ -59,7 +65,7 @@ class Unit:
         unit.exitInitializationMode()
 
     def step(self, k, unit=None):
-        """Make step k, of one control period."""
+        """Make step k, from time k `period`, of one control period; unit: an instance, by default the first one."""
         (unit or self.unit).doStep(currentCommunicationPoint=k * self.period, communicationStepSize=self.period)
 
     def names(self, causality):
@@ -68,7 +74,10 @@ class Unit:
 
 
 def closed_loop(loop, count, parameters=()):
-    """Simulate `count` periods of controller and plant; return the plant's outputs and the commands at each sample."""
+    """Return [(outputs of the plant, commands of the controller), ..] of `count` periods, two dicts for each sample.
+
+    loop: the units of controller and plant. parameters: start values of the plant.
+    """
     controller, plant = loop
     plant.begin(parameters)
     readings = plant.read(plant.names("output"))

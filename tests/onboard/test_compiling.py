@@ -18,14 +18,14 @@ from tests.onboard.flights import FLIGHTS
 
 @pytest.fixture(scope="module")
 def chain(tmp_path_factory):
-    """Export the controller of a chain and return its folder."""
+    """Return the folder to which the controller of a chain is exported."""
     place = tmp_path_factory.mktemp("exported") / "controller"
     program(FLIGHTS["chain"], place)
     return place
 
 
 def parts(name, **loop):
-    """The parts of a scenario in FLIGHTS, with changes of its loop table."""
+    """Return the parts of a scenario in FLIGHTS on the flight clock, with changes of its loop table."""
     tables = {**FLIGHTS[name], "loop": {**FLIGHTS[name]["loop"], **loop}}
     return scenario.study(folder.on_flight_clock(scenario.reading.complete(scenario.from_tables(tables)))).parts
 

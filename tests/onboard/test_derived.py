@@ -73,7 +73,8 @@ FLOWN = {
 def off(known, library):
     """Return the largest difference between commands of the compiled C and of the simulation in two trials.
 
-    The difference is relative to the largest command.
+    The difference is relative to the largest command of the trial. known: the scenario. library: its compiled
+    controller.
     """
     ready = scenario.study(folder.on_flight_clock(known))
     computer, trials = build_board(ready.parts), jnp.arange(2, dtype=jnp.uint32)
@@ -95,7 +96,7 @@ def off(known, library):
 
 
 def put(library, name, value):
-    """Set a parameter of the compiled controller."""
+    """Set a parameter of the compiled controller; name: in C, value: a number or an array of all its entries."""
     columns = library.columns["params"]
     at = [k for k, column in enumerate(columns) if column.partition("[")[0] == name]
     assert at, (name, columns)

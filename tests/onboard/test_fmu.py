@@ -57,7 +57,10 @@ def made_from(tables, reference_input=False):
 
 
 def simulated(made, seed, trials):
-    """Histories of trials: true states (trials, samples, n) in the order of the FMU, with their disturbances."""
+    """Return true states and disturbances (trials, samples, n) by the simulator, in the order of the FMU.
+
+    made: the controller, whose scenario is simulated. trials: their numbers.
+    """
     plant = made.ready.parts.plant
 
     def run(trial):
@@ -72,7 +75,10 @@ def simulated(made, seed, trials):
 
 
 def true_states(made, rows):
-    """Return the true states in the columns of `simulated`, from the rows of a closed loop of FMUs, (samples, n)."""
+    """Return the true states and disturbances (samples, n) of a closed loop of FMUs, in the columns of `simulated`.
+
+    rows: of `closed_loop`.
+    """
     names = [*sorted(made.ready.parts.plant.signals), "disturbance"]
     columns = [name for one in names for name in rows[0][0] if name.partition("[")[0] == f"true_{one}"]
     return np.array([[readings[name] for name in columns] for readings, _ in rows])
@@ -80,13 +86,16 @@ def true_states(made, rows):
 
 @pytest.fixture(scope="module")
 def rich():
-    """Return the controller of a scenario with wheels, delay, filter, noise, dispersions and a wheel failure."""
+    """Return the `folder.Controller`, from which both FMUs are exported.
+
+    Its scenario has wheels, delay, filter, noise, dispersions and a wheel failure.
+    """
     return made_from(RICH)
 
 
 @pytest.fixture(scope="module")
 def files(rich, tmp_path_factory):
-    """The folder of the FMUs of controller and plant for both versions of FMI."""
+    """Return the folder of the FMUs of controller and plant for both versions of FMI."""
     place = tmp_path_factory.mktemp("fmus")
     fmus = folder.Fmus(controller=True, plant=True)
     fmus.write(place, rich)
@@ -95,13 +104,13 @@ def files(rich, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def expected(rich):
-    """Return the true states of trials 0 and 3, computed by the simulator."""
+    """Return the true states (2, samples, n) of trials 0 and 3, computed by the simulator."""
     return simulated(rich, SEED, [0, 3])
 
 
 @pytest.fixture(scope="module")
 def library(tmp_path_factory):
-    """Return the compiled C code of the controller, exported without an FMU."""
+    """Return the compiled C code of the controller as a `Library`, exported without an FMU."""
     place = tmp_path_factory.mktemp("exported") / "c"
     program(RICH, place)
     return Library(place)
@@ -109,7 +118,7 @@ def library(tmp_path_factory):
 
 @pytest.fixture(scope="module", params=fmu_files.VERSIONS)
 def loop(files, request):
-    """Load the FMUs of controller and plant of one version of FMI."""
+    """Return the units (controller, plant) of one version of FMI."""
     return tuple(Unit(files / f"{name}_fmi{request.param}.fmu") for name in ("controller", "plant"))
 
 
@@ -134,7 +143,10 @@ def test_closed_loop_of_fmus_equals_the_simulation(rich, expected, loop):
 
 
 def assert_outputs_of_the_c(library, controller, rows):
-    """Assert that a controller FMU has returned the outputs and statuses of the exported C, to the last bit."""
+    """Assert that a controller FMU has returned the outputs and statuses of the exported C, to the last bit.
+
+    controller: its unit. rows: of `closed_loop`.
+    """
     state, columns = library.initial_state(), library.columns
     for name, value in rows[0][0].items():
         if name.startswith("initial_"):

@@ -28,7 +28,7 @@ from tests.onboard.flights import FLIGHTS, flight
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
-    """The exported folder of a short scenario without filter."""
+    """Return the path of the exported folder of a short scenario without filter."""
     place = tmp_path_factory.mktemp("short")
     (place / "short.toml").write_text(SHORT)
     return folder.export(place / "short.toml", place / "controller", trials=2)
@@ -40,7 +40,7 @@ QUICK = "CFLAGS=-O0"  # for builds that another test compiles with optimisation
 
 
 def make(place, *args):
-    """Run make in a folder with these arguments, and return the finished process."""
+    """Run make in a folder with these arguments, and return the finished process with its output as text."""
     environment = {
         name: value for name, value in os.environ.items() if name not in ("MAKEFLAGS", "MFLAGS", "MAKELEVEL")
     }
@@ -78,7 +78,10 @@ EVERY = [(plant, kind) for plant, laws in LAWS.items() for kind in laws if kind 
 
 
 def of_law(plant, kind):
-    """Return the tables of a short scenario with this law and its default gains."""
+    """Return the tables of a short scenario with this law and its default gains.
+
+    plant: spacecraft, chain or system. kind: of the controller.
+    """
     gains = {"delta": 0.5} if kind == "prescribed_time" else {}
     tables = {"spacecraft": FLIGHTS["raw"], "chain": FLIGHTS["chain"], "system": FLIGHTS["system"]}[plant]
     return {**tables, "controller": {"kind": kind, "t_f": 5.0, **gains}}
@@ -99,7 +102,7 @@ class Odd(ptsmc.AccelerationLaw):
     """A law whose memory has integers, an empty array, and names that are not allowed in a C struct."""
 
     def begin(self) -> Any:
-        """Return the initial memory [-]."""
+        """Return the initial memory, a dict of arrays."""
         return {"none": jnp.zeros(0), "I": jnp.zeros(3), "i": jnp.zeros((2, 3), int), "a b": jnp.zeros(()), "a-b": 0.0}
 
     def acceleration(self, now: Any, error: Any, error_rate: Any, bound: Any) -> Any:
@@ -116,14 +119,18 @@ class Named(ptsmc.AccelerationLaw):
     k: float = ptsmc.gain(1.0, (0.1, 10.0), meaning="of v, */ and of /* v", unit="1/s^2")
 
     def __call__(self, now: Any, x: Any, target: Any, d_hat: Any, k2: Any) -> Any:
-        """Use a variable `d`, the name of a pointer in the C, and the inverse inertia, which that pointer provides."""
+        """Return the torque, the body rate as s, and the memory.
+
+        The code uses a variable `d`, the name of a pointer in the C, and the inverse inertia, which that pointer
+        provides.
+        """
         d = jnp.sum(x.w * x.w)
         damped = self.model.inertia_inverse @ (-self.k * x.q[:3] - 2.0 * x.w) / (1.0 + d)
         return self.model.inertia @ self.model.inertia @ damped * (1.0 + d), x.w, now.memory
 
 
 def with_custom_law(law):
-    """Return a short scenario with a custom law and a moving reference."""
+    """Return a short scenario with a custom law and a moving reference; law: its class."""
     moving = {"kind": "spin", "rate": [0.01, 0.02, -0.01]}
     simulated = {**FLIGHTS["raw"], "reference": moving, "controller": {"kind": "custom", "code": law, "t_f": 5.0}}
     return scenario.reading.complete(scenario.from_tables(simulated))
@@ -169,7 +176,7 @@ class Halving(ptsmc.AccelerationLaw):
     """PD with a command that is halved until it is small."""
 
     def acceleration(self, now: Any, error: Any, error_rate: Any, bound: Any) -> Any:
-        """Use a loop with an unknown number of passes."""
+        """Return a PD command, halved by a loop with an unknown number of passes, and the error as s."""
         start = -error - 2.0 * error_rate
         return jax.lax.while_loop(lambda a: jnp.max(jnp.abs(a)) > 1.0, lambda a: 0.5 * a, start), error
 
@@ -181,7 +188,7 @@ def test_readme_reports_loops_with_an_unknown_number_of_passes(law, said, tmp_pa
 
 
 class Unsigned(Odd):
-    """A law with numbers of a type that C does not have here."""
+    """A law whose memory is an unsigned 64-bit integer, a type that the export refuses."""
 
     def begin(self) -> Any:
         """Return the initial memory, an unsigned integer of 64 bits [-]."""

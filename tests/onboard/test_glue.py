@@ -20,7 +20,7 @@ SAMPLES = 5
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
-    """The folder of a controller with its programs, and its inputs, outputs and statuses at some samples."""
+    """Return the folder of a controller with its compiled programs, and [(inputs, outputs, status), ..] of samples."""
     place = tmp_path_factory.mktemp("glue") / "controller"
     program(FLIGHTS["raw"], place)
     for target in ("udp", "shared"):

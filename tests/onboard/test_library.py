@@ -31,7 +31,10 @@ OK, SATURATED, MISSED, SINGULAR, INPUT, OVERFLOW = range(len(STATUS))
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
-    """A function that compiles the controller of a scenario once; it returns the controller and a reset library."""
+    """Return a function of the name of a scenario in FLIGHTS that returns its controller and its compiled `Library`.
+
+    The controller is compiled once. The parameters of the library are reset at each call. real: number type of the C.
+    """
 
     @cache
     def written(name):
@@ -74,13 +77,13 @@ def test_compiled_controller_in_the_loop_equals_the_simulation(name, exported):
 
 @pytest.fixture(scope="module")
 def filtered(exported):
-    """The compiled controller of a scenario with attitude filter, and inputs (samples, columns)."""
+    """Return the compiled controller of a scenario with attitude filter, and inputs (samples, columns)."""
     made, library = exported("star tracker out of step")
     return library, given(made)
 
 
 def given(made):
-    """Valid samples of star tracker and gyro for a slowly rotating body."""
+    """Return valid inputs (samples, columns) of a slowly rotating body; made: the controller."""
     t = 0.1 * np.arange(40)
     half = 0.25 + 0.01 * t
     one, none = np.ones_like(t), np.zeros_like(t)
@@ -90,12 +93,12 @@ def given(made):
 
 
 def simulated(library, samples):
-    """Return statuses and outputs of a compiled controller for a sequence of samples, from its initial state."""
+    """Return statuses and outputs of a compiled controller for inputs (samples, columns), from its initial state."""
     return replayed(library, samples, library.initial_state())[:2]
 
 
 def changed(library, samples, at, **values):
-    """The samples with one sample changed; the keys are names of columns without their indices."""
+    """Return the inputs (samples, columns) with changes in sample `at`; values: by names of columns without indices."""
     found, names = samples.copy(), library.columns["in"]
     for name, value in values.items():
         columns = [k for k, column in enumerate(names) if column.split("[")[0] == name]
@@ -365,7 +368,10 @@ class Measured(ptsmc.Draw):
     """A draw of the inertia that is also known to the flight computer, with matching gains."""
 
     def at(self, c, parts):
-        """The parts with the measured inertia and matching gains."""
+        """Return parts whose plant and flight software have the inertia times 1 + 0.05 c[0].
+
+        c: random numbers (1,). The gains eta, of the observer and of the filter are changed to match.
+        """
         factor = 1.0 + 0.05 * c[0]
         parts = parts.with_inertia(factor * paths.get(parts, "plant.inertia"))
         law = replace(parts.controller, eta=factor * parts.controller.eta)

@@ -23,7 +23,7 @@ class Horizon(ptsmc.AttitudeSensor):
     scale: float = ptsmc.number(1.0, above=0.0, meaning="of both", unit="-")
 
     def read(self, q):
-        """Return the components [-] of the sensor's z and x axes along inertial z, times `scale`."""
+        """Return the components (2,) [-] of the sensor's z and x axes along inertial z, times `scale`."""
         axes = attitude.multiply(q, self.mounting)
         along = [attitude.rotate(axes, jnp.eye(3)[k])[2] for k in (2, 0)]
         return self.scale * jnp.stack(along)
@@ -49,7 +49,10 @@ pytestmark = needs_compiler
 
 @pytest.fixture(scope="module")
 def suite(tmp_path_factory):
-    """The compiled controller, and inputs, outputs and states of a simulated trial, with the initial state first."""
+    """Return the compiled controller, and inputs, outputs and states (samples, columns) of a simulated trial.
+
+    The states have one more row: the initial state is the first one.
+    """
     place = tmp_path_factory.mktemp("suite") / "controller"
     made = program(TABLES, place)
     samples = folder.simulate(made, 3, 1)[0]
@@ -58,7 +61,7 @@ def suite(tmp_path_factory):
 
 
 def columns(library, name):
-    """Return the places of a quantity in the inputs of the compiled controller, one for each component."""
+    """Return the places of a quantity in the inputs of the compiled controller, a list with one for each component."""
     return [k for k, column in enumerate(library.columns["in"]) if column.partition("[")[0] == name]
 
 

@@ -19,12 +19,12 @@ MATRIX = np.array([[2.0, 0.3, -0.1], [0.3, 1.5, 0.2], [0.0, 0.2, 1.1]])
 
 
 def counted(x):
-    """Return the result of a loop with 30 passes."""
+    """Return the result of a loop with 30 passes, an array like x."""
     return jax.lax.fori_loop(0, 30, lambda k, y: 0.9 * y + jnp.sin(x) / (k + 1.0), x)
 
 
 def gone_through(x):
-    """Return the last carry and all outputs of a scan over the rows of two tables."""
+    """Return the last carry (3,) and the outputs (20, 3) of a scan over the rows of two tables; x: (3,)."""
 
     def step(total, row):
         return total + row[0] * x, total * row[1]
@@ -33,7 +33,7 @@ def gone_through(x):
 
 
 def backwards(x):
-    """Return the last carry and all outputs of a scan from the last row of a table to the first."""
+    """Return the last carry and all outputs of a scan from the last row of a table of 20 numbers to the first."""
     return jax.lax.scan(lambda c, row: (c * 0.5 + row, c), x, jnp.linspace(0.0, 1.0, 20), reverse=True)
 
 
@@ -43,17 +43,17 @@ def until(x):
 
 
 def branched(x):
-    """Return the result of one of two branches, chosen by the sign of x[0]."""
+    """Return an array like x and a number from one of two branches, chosen by the sign of x[0]."""
     return jax.lax.cond(x[0] > 0.0, lambda: (jnp.cos(x), x[1]), lambda: (jnp.sin(x), x[2]))
 
 
 def switched(x):
-    """Return the result of one of four branches, chosen by an index from x[0]."""
+    """Return an array like x from one of four branches, chosen by an index from x[0]."""
     return jax.lax.switch(jnp.int32(3.0 * x[0] + 1.5), [lambda: x, lambda: 2.0 * x, lambda: x**2, lambda: x[::-1]])
 
 
 def tabled(x):
-    """Return the value of a table, interpolated at x[0]."""
+    """Return a number, interpolated in a table at x[0]."""
     return jnp.interp(x[0], jnp.linspace(-1.0, 1.0, 5), jnp.asarray([1.0, 3.0, 2.0, -1.0, 0.5]))
 
 

@@ -7,12 +7,12 @@ from tuning.output import summaries
 
 
 def entry(verdict: Verdict, **changes: Any) -> summaries.Entry:
-    """Return a verdict in the form that a summary has."""
+    """Return a verdict in the form that a summary has; changes: other values of its fields."""
     return summaries.read(summaries.Entry, {**verdict.in_summary(), **changes})
 
 
 def group(**changes: Any) -> dict[str, Any]:
-    """Return gains and the statistics of their trials."""
+    """Return a dict of gains and the statistics of their trials, as a summary of a tuning has it."""
     return {"gains": {}, "lower_bound": None, "trials": 64, "counts": {"ok": 64}, **changes}
 
 
@@ -37,7 +37,10 @@ def tune(search: dict[str, Any] | None = None, trust: dict[str, Any] | None = No
 
 
 def torque(times: float | None, failures: int = 0, trials: int = 64) -> dict[str, Any]:
-    """Return the verdict on a peak torque of at most 0.5 N m that reaches `times` the limit."""
+    """Return the verdict, as a summary has it, on a peak torque that reaches `times` its limit of 0.5 N m.
+
+    times: None for a torque that is not known. failures: number of failed trials.
+    """
     verdict = Requirement("peak_torque", 0.5).verdict
     import numpy as np
 
@@ -46,7 +49,7 @@ def torque(times: float | None, failures: int = 0, trials: int = 64) -> dict[str
 
 
 def law(**changes: Any) -> dict[str, Any]:
-    """Return a law of a comparison without numbers."""
+    """Return the entry of a law in the summary of a comparison; all its statistics are None, except `changes`."""
     numbers = ("window_error", "window_error_interval", "lower_bound", "peak_torque", "largest_peak_torque", "effort",
                "chattering", "settling_time", "settling_near_far", "margins")  # fmt: skip
     return {**dict.fromkeys(numbers), "gains": {}, "gain_units": {}, "at_bound": {}, "widened_bounds": {}, "met": True,
@@ -54,7 +57,7 @@ def law(**changes: Any) -> dict[str, Any]:
 
 
 def compare(laws: dict[str, Any], **changes: Any) -> summaries.Compare:
-    """Return the summary of a comparison."""
+    """Return the summary of a comparison; laws: {name: entry of `law`}."""
     summary = {"status": "met", "trials": 8, "published_unavailable": None, "published_label": None,
                "judged_on": "flight clock",
                "settling_angle": 1e-3, "warnings": []}  # fmt: skip
@@ -62,7 +65,7 @@ def compare(laws: dict[str, Any], **changes: Any) -> summaries.Compare:
 
 
 def campaign(**changes: Any) -> summaries.Campaign:
-    """Return the summary of a campaign."""
+    """Return the summary of a campaign; changes: other values of its fields."""
     summary = {"status": "met", "plant": "spacecraft", "seed": 1, "run_table": None, "trials": 8, "simulated": 8,
                "unjudged": [], "counts": {"ok": 8}, "reasons": [], "lower_bound": None, "verdicts": [], "quantiles": {},
                "drivers": {}, "driver_trials": {}, "warnings": []}  # fmt: skip

@@ -56,12 +56,12 @@ class Page(HTMLParser):
 
     @property
     def text(self):
-        """The text that a reader of the page sees."""
+        """The text that a reader of the page sees, with single spaces."""
         return " ".join(" ".join(self.texts).split())
 
     @property
     def charts(self):
-        """Data of the charts by name."""
+        """Data of the charts by the name of their places, a dict."""
         return json.loads(self.scripts[0]) if self.scripts else {}
 
 
@@ -90,5 +90,5 @@ def checked(folder):
 
 
 def read_versions(folder):
-    """Return the content of versions.json, the record of the command of a result folder."""
+    """Return the content of versions.json, the record of the command of a result folder, as a dict."""
     return json.loads((folder / "versions.json").read_text())

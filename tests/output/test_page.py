@@ -24,7 +24,10 @@ HOSTILE = "<img src=x onerror=document.title=1>\"'&</script><script>alert(1)</sc
 
 
 def in_chromium(path, tmp_path, *options):
-    """Return a page rendered by Chromium, and the messages of its console."""
+    """Return the HTML of a page after rendering by Chromium, and the list of messages of its console.
+
+    options: of Chromium. Two harmless messages are left out.
+    """
     assert CHROMIUM is not None
     with tempfile.TemporaryDirectory() as home:
         done = subprocess.run(
@@ -46,7 +49,7 @@ def kept(tmp_path_factory):
 
 @pytest.fixture
 def simulated(command, kept, tmp_path):
-    """A copy of the results of one run."""
+    """Return the folder of a copy of the results of one run."""
     if not kept.exists():
         assert command("simulate", "s.toml", "--trial", 3, "--seed", 5, "--out", kept, "--quiet")[0] in (0, 1)
     return shutil.copytree(kept, tmp_path / "run")
@@ -273,6 +276,7 @@ def test_an_error_in_the_code_of_the_page_is_not_reported_as_a_damaged_file(simu
 
 
 def raise_type_error(*_, **__):
+    """Raise a `TypeError`, for any arguments."""
     raise TypeError("an error of the code")
 
 

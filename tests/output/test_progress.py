@@ -37,7 +37,10 @@ def test_progress_line_has_the_number_of_steps(capsys, monkeypatch):
 
 
 def reported(bar, monkeypatch, *reports):
-    """Return the texts of a bar after reports, each a time [s] and the arguments of the report, if there is one."""
+    """Return the texts of a bar after reports.
+
+    Each report is a time [s] and the arguments of the bar, or only a time to display the bar again.
+    """
     texts = []
     for now, *arguments in reports:
         monkeypatch.setattr(progress.time, "monotonic", lambda now=now: now)
@@ -88,7 +91,7 @@ def test_the_time_left_of_a_step_follows_from_the_work_done_so_far(monkeypatch):
 
 @pytest.fixture
 def unread():
-    """A stream into a pipe whose reader has closed it."""
+    """Yield a stream for writing into a pipe whose reader has closed it."""
     reading, writing = os.pipe()
     os.close(reading)
     with contextlib.suppress(OSError), os.fdopen(writing, "w") as stream:

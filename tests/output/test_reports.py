@@ -39,7 +39,7 @@ EXPECTED = Path(__file__).with_name("reports.txt")
 
 
 def text_of(value: Any) -> str:
-    """Return a report, a table or lines as text."""
+    """Return a report, a table or lines as one text."""
     if isinstance(value, Report):
         parts = [text_of(block if isinstance(block, Table) else [title, *block]) for title, block in value.printed()]
         return "\n".join([f"[{value.mood}] {value.headline}", *value.lines, *parts])
@@ -52,12 +52,18 @@ def text_of(value: Any) -> str:
 
 
 def errors(rms: float, interval: Any = None, largest: float | None = None) -> dict[str, Any]:
-    """Return the statistics of a metric over trials, as a summary has them; interval: of the RMS."""
+    """Return the statistics of a metric over trials, as a summary has them.
+
+    interval: of the RMS. largest: by default `rms`.
+    """
     return {"mean": rms, "rms": rms, "max": largest or rms, "rms_interval": interval}
 
 
 def broken(times: float | None, searched: float = 0.97) -> summaries.Tune:
-    """Return a summary whose held-out trials reach `times` the limit of 0.5 N m, and its training trials `searched`."""
+    """Return the summary of a tuning whose trials reach multiples of the torque limit of 0.5 N m.
+
+    times: the multiple of the held-out trials. searched: the multiple of the training trials.
+    """
     return examples.tune({"largest_over_limit": {"peak_torque": searched}}, verdicts=[examples.torque(times)])
 
 
@@ -68,19 +74,19 @@ MARGIN = {"metric": "gain_margin", "limit": 6.0, "unit": "dB", "worst": 5.0, "ma
 
 
 def earlier(metric: str) -> dict[str, Any]:
-    """Return an earlier search whose gains exceeded a limit by a tenth on held-out trials."""
+    """Return the record of an earlier search whose gains exceeded a limit by a tenth on held-out trials."""
     return {"margins": {metric: 0.03}, "over": {metric: 1.1}, "held_out_seed": 7}
 
 
 def advice(verdict: dict[str, Any], **search: Any) -> Iterable[str]:
-    """Return the advice of a tuning with this verdict on held-out trials; search: changes of its record."""
+    """Return the lines of advice after a tuning with this verdict on held-out trials; search: changes of its record."""
     return tune_report.advice_lines(
         examples.tune({"largest_over_limit": {verdict["metric"]: 0.99}, **search}, verdicts=[verdict])
     )
 
 
 def advice_on_time(interpretation: str) -> Iterable[Any]:
-    """Return the advice if a limit is exceeded by a tenth for 3 % of the time, and the advice if a run fails.
+    """Return the lines of advice if a limit is exceeded by a tenth for 3 % of the time, and if a run fails.
 
     The limit may be exceeded for 0.1 % of the time.
     """
@@ -90,7 +96,10 @@ def advice_on_time(interpretation: str) -> Iterable[Any]:
 
 
 def advice_on_margin(metric: str, limit: float, worst: float) -> Iterable[Any]:
-    """Return the advice if 38 of 256 loops break a limit of a margin, and the advice if the nominal loop breaks it."""
+    """Return the lines of advice if 38 of 256 loops break a limit of a margin, and if the nominal loop breaks it.
+
+    worst: margin of the loops that break the limit.
+    """
     asked = Requirement(metric, limit, at_least=metric != "peak_sensitivity", unit=MARGINS[metric].unit)
     verdict = asked.verdict(np.where(np.arange(256) < 38, worst, limit), np.ones(256, bool)).in_summary()
     return advice(verdict), advice({**verdict, "trials": 1})
@@ -105,7 +114,7 @@ def verified(count: int) -> Any:
 
 
 def conflict(**limits: float | None) -> Iterable[str]:
-    """Return the report of a search with limits that conflict.
+    """Return the lines on a search with limits that conflict.
 
     limits: ratio of the metric to each limit if this limit is ignored and all others are kept, or None.
     """
@@ -115,19 +124,25 @@ def conflict(**limits: float | None) -> Iterable[str]:
 
 
 def skipped(reached: float, **changes: Any) -> Iterable[str]:
-    """Return the report of a search that does not confirm a quantile if it exceeds a limit by more than a tenth."""
+    """Return the lines on a search that does not confirm a quantile if it exceeds a limit by more than a tenth.
+
+    reached: largest peak torque over its limit. changes: of the verdict on the quantile.
+    """
     asked = Requirement("effort", 9.0, quantile=0.9).verdict(np.zeros(10), np.ones(10, bool)).in_summary()
     found = {"largest_over_limit": {"peak_torque": reached, "effort": 0.5}}
     return tune_report.search_lines(examples.tune(found, verdicts=[examples.torque(1.2), {**asked, **changes}]))
 
 
 def accuracy(times: float | None, **changes: Any) -> Iterable[str]:
-    """Return the comparison of tuned with published gains; times: error of the published gains over the tuned error."""
+    """Return the lines that compare tuned with published gains.
+
+    times: error of the published gains over the tuned error, or None.
+    """
     return tune_report.accuracy_lines(examples.tune(accuracy_gain_over_published=times, **changes))
 
 
 def searched(**search: Any) -> Iterable[str]:
-    """Return the report of a search with this record."""
+    """Return the lines on a search with this record."""
     return tune_report.search_lines(examples.tune(search))
 
 
@@ -138,13 +153,16 @@ WORST_CASE = {"metric": "peak_torque", "ratio": 1.03, "unbounded": False, "break
 
 
 def shortest(theory: float | None, simulated: float | None, quantile: float | None = None) -> Any:
-    """Return the report of a tuning with the shortest t_f [s] for a torque limit by theory, simulation and quantile."""
+    """Return the report of a tuning with the shortest t_f [s] for a torque limit, or None if it is not known.
+
+    theory, simulated, quantile: the shortest t_f by each method.
+    """
     times = {"limit": 0.5, "theory": theory, "simulated": simulated, "quantile": quantile, "unit": "N m"}
     return tune_report.build(examples.tune(shortest_t_f=times))
 
 
 def diagnostics(at_bound: dict[str, str] | None = None, **trust: Any) -> Iterable[str]:
-    """Return the checks of a tuning that its report lists; at_bound: gains that ended at a bound."""
+    """Return the lines on the checks of a tuning; at_bound: gains that ended at a bound, trust: their results."""
     return tune_report.diagnostic_lines(examples.tune(trust=trust, at_bound=at_bound or {}))
 
 
@@ -155,14 +173,20 @@ def gains_by_axis(**tuned: float) -> Table:
 
 
 def fitted(least: float) -> Iterable[str]:
-    """Return the advice for an RMS of 1.49 to 2.01 in 16 training trials, and from `least` on in held-out trials."""
+    """Return the lines of advice for a 95 % interval of the RMS of 1.49 to 2.01 in 16 training trials.
+
+    least: lower end of the interval in held-out trials.
+    """
     at = {"training": (1.49, 2.01), "held_out": (least, 2.48)}
     groups = {on: examples.group(window_error=errors(1.0, interval)) for on, interval in at.items()}
     return tune_report.advice_lines(examples.tune({"averaged": 16}, **groups))
 
 
 def margins_of(required: bool = False, **ends: dict[str, Any]) -> Iterable[str]:
-    """Return the report of margins; ends: changes of the default margins in each phase, hold or before."""
+    """Return the lines on margins; ends: changes of the default margins in each phase, hold or before.
+
+    required: whether the scenario limits margins.
+    """
     known = {"stable": True, "gain_margin": 6.0, "phase_margin": 30.0, "delay_margin": 0.1, "peak_sensitivity": 5.0}
     loops = {name: {**known, **changes} for name, changes in ends.items()}
     return margins_report.tuned_margin_lines(loops, required=required)
@@ -270,7 +294,7 @@ TUNINGS: dict[str, Callable[[], Any]] = {
 
 
 def front(*points: Point, **changes: Any) -> Front:
-    """Return a front after a round trip through summary.json."""
+    """Return a Pareto front of these points, after a round trip through summary.json."""
     known: Any = {
         "against": "torque", "plant": "spacecraft", "points": list(points), "idle": [], "without": [], "trials": 1000,
         "seed": 1, "interval_confidence": 0.95, "lower_bound": None, "rollouts": 1, "gradients": 1, "requirements": [],
@@ -280,19 +304,19 @@ def front(*points: Point, **changes: Any) -> Front:
 
 
 def torque(limit: float, peak: float, rms: float, gains: Any = (("eta", 3.0),), **changes: Any) -> Point:
-    """Return a point of a front over limits of the torque [N m]."""
+    """Return a point of a Pareto front over limits of the torque [N m]; limit, peak: torques, rms: error."""
     return Point(limit, dict(gains), rms, costs={"peak_torque": peak, "mean_peak_torque": peak / 2}, **changes)
 
 
 def robust(limit: float, rms: float, **margins: float) -> Point:
-    """Return a point of a front over limits of the margins."""
+    """Return a point of a Pareto front over limits of the margins; margins: other values of the reached margins."""
     costs = {"gain_margin": 6.1, "phase_margin": 40.0, "delay_margin": math.inf, "peak_sensitivity": 5.8, **margins}
     interval = (0.95 * rms, 1.05 * rms)
     return Point(limit, {"eta": 3.0, "observer_gain_2": 25.0}, rms, interval, {"peak_torque": 0.2, **costs}, meets=True)
 
 
 def slew(t_f: float, rms: float, peak: float, **changes: Any) -> Point:
-    """Return a point of a front over the slew time t_f [s]."""
+    """Return a point of a Pareto front over the slew time t_f [s]; peak: torque [N m]."""
     return Point(t_f, {"eta": 3.0}, rms, (0.9 * rms, 1.1 * rms), {"peak_torque": peak}, **changes)
 
 
@@ -334,7 +358,7 @@ ERROR = {"without_value": 0, "rms": 1e-5, "max": 1e-5, "0.5": {"value": 1e-5, "l
 
 
 def fractions() -> Iterable[str]:
-    """Return a verdict on a fraction of the trials, 59 of 60 or 98.33 %, and a verdict on fractions of time."""
+    """Return the texts of two verdicts: on a fraction of the trials, 59 of 60 or 98.33 %, and on fractions of time."""
     asked = Requirement("peak_torque", 0.5, quantile=0.95)
     verdict = asked.verdict(np.r_[np.zeros(59), 1.0], np.ones(60, bool))
     found = examples.entry(verdict, fraction=59 / 60, fraction_interval=[0.91056, 0.99957], fraction_bound=0.92333)
@@ -344,7 +368,7 @@ def fractions() -> Iterable[str]:
 
 
 def settling(without: int) -> Iterable[Table]:
-    """Return the quantiles if some trials never settled, of which one failed."""
+    """Return the tables of quantiles if `without` of 60 trials never settled, of which one failed."""
     times = {"without_value": without, "max": 57.2, "0.5": AT, "0.9973": AT}
     counts = {"ok": 58, "not_converged": 1, "diverged": 1}
     return campaign_report.quantile_tables(examples.campaign(counts=counts, quantiles={"settling_time": times}))
@@ -356,7 +380,10 @@ def campaign_gains(**tables: dict[str, Any]) -> Table:
 
 
 def pairs(count: int, meets: float = math.nan) -> Iterable[str]:
-    """Return the report of a map with `count` pairs; meets: 1 if the pairs keep every requirement, NaN without any."""
+    """Return the lines on a map with `count` of five pairs.
+
+    meets: 1 if the pairs keep every requirement, NaN without any.
+    """
     pair = {"status": "simulated", "failures": 0.0, "not_converged": 0.0, "window_error": 2e-6, "peak_torque": 0.3,
             "meets": meets, "not_met": ""}  # fmt: skip
     every = [
@@ -377,7 +404,7 @@ def pairs(count: int, meets: float = math.nan) -> Iterable[str]:
 
 
 def map_of(plant: str) -> Report:
-    """Return the report of a map with one pair that was simulated."""
+    """Return the report of a map with two pairs: one simulated, one refused for its delta; plant: its kind."""
     head = ["loop.period [s]", "controller.delta [s]", "status", "failures", "not_converged", "window_error",
             "peak_torque", "linear_window_error", "linear_torque", "hold_delay_margin",
             "gain_margin", "meets", "not_met"]  # fmt: skip
@@ -387,7 +414,7 @@ def map_of(plant: str) -> Report:
 
 
 def compared() -> Table:
-    """Return the comparison of two laws. 12 of 1000 trials of PD break a limit."""
+    """Return the table that compares two laws. 12 of 1000 trials of PD break a limit."""
 
     def law(failures: int, **changes: Any) -> dict[str, Any]:
         verdict = Requirement("peak_torque", 0.5).verdict(np.arange(1000) < failures, np.ones(1000, bool))
@@ -410,7 +437,10 @@ def compliance() -> Table:
 
 
 def budget(simulated: int, ok: int, not_converged: int = 0) -> str:
-    """Return the reason of an absent angle of a budget; runs that do not converge by t_f have angles."""
+    """Return the line with the reason of an absent angle of a budget, for these numbers of trials.
+
+    Runs that do not converge by t_f have angles.
+    """
     told = {"after": 0.0, "boresight": [1.0, 0.0, 0.0], "probability": 0.9973, "confidence": 0.95, "window": 1.0,
             "budget": {"ape": {"x": None}}}  # fmt: skip
     counts = {"ok": ok, "not_converged": not_converged}
@@ -427,14 +457,14 @@ def most_accurate_law(pd_error: float) -> str:
 
 
 def run(lower_bound: float | None) -> Report:
-    """Return the report of a single run with this lower bound of the error."""
+    """Return the report of a single run with this lower bound of the window error, or None."""
     told = {"status": "ok", "reason": "", "bad_time": None, "window_error": 1e-5, "verdicts": [], "warnings": []}
     angles = {"window_angle": 2e-5, "hold_angle": 0.02, "peak_rate": 0.02}  # in arcsec, in deg, and no angle
     return reports.build("simulate", {**told, **angles, "lower_bound": lower_bound}, "spacecraft")
 
 
 def quantiles_of_angles() -> list[Table]:
-    """Return the table of a metric in rad whose largest value is above one degree, and of one that is not."""
+    """Return the tables of two metrics in rad: the largest value of one is above one degree."""
     tail = {"value": 4e-5, "low": 3e-5, "high": 6e-5}
     small = {"without_value": 0, "max": 7e-5, "0.5": {"value": 1e-5, "low": 9e-6, "high": 2e-5}, "0.9973": tail}
     quantiles = {"window_angle": small, "hold_angle": {**small, "max": 0.02}}
@@ -475,7 +505,10 @@ def approach(judged: bool) -> Report:
 
 
 def worst_trials(by: str, **columns: list[Any]) -> Table:
-    """Return the table of two trials; an error of 1e-5 is an angle of 4.13 arcsec."""
+    """Return the table of two trials, ordered by the metric `by`; columns: other columns of the rows.
+
+    An error of 1e-5 is an angle of 4.13 arcsec.
+    """
     known = {"trial": [7, 3], "status": ["diverged", "ok"], "window_error": [None, 1e-5], "window_angle": [None, 2e-5],
              "peak_torque": [0.2, 0.1], "initial_angle": [0.5, 1e-3], "initial_w2": [2e-3, 1e-3],
              **columns}  # fmt: skip
@@ -484,7 +517,7 @@ def worst_trials(by: str, **columns: list[Any]) -> Table:
 
 
 def why(*rows: dict[str, Any], **changes: Any) -> Iterable[str]:
-    """Return the explanation of a worst trial; each row is an unusual input.
+    """Return the lines that explain a worst trial; each row is an unusual input.
 
     The `fraction` of a row is the fraction of trials with the same category.
     """
@@ -560,7 +593,7 @@ CASES = {**TUNINGS, **{name: lambda made=made: front_report.build(made()) for na
 
 
 def expected() -> dict[str, str]:
-    """Return the texts of the file by the names of their cases."""
+    """Return the texts of the file `EXPECTED` by the names of their cases."""
     blocks = EXPECTED.read_text(encoding="utf-8").removeprefix("## ").split("\n\n## ")
     return {name: text.rstrip("\n") for name, _, text in (block.partition("\n") for block in blocks)}
 
@@ -612,7 +645,10 @@ NO_DRIVER = "no dispersed quantity alone explains 5 % of the variance of the ran
 
 
 def driver_lines(drivers, trials):
-    """Return the sentences of a campaign report on the inputs that drive the window error."""
+    """Return a list of the sentences of a campaign report on the inputs that drive the window error.
+
+    drivers: as in a summary. trials: number of trials of the analysis.
+    """
     found = {"drivers": {"window_error": drivers}, "driver_trials": {"window_error": trials}}
     return list(campaign_report.driver_lines(examples.campaign(simulated=10_000, trials=10_000, **found)))
 

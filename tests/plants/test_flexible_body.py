@@ -45,7 +45,7 @@ def body(damping=DAMPING):
 
 
 def state(seed):
-    """Return a random attitude, rate and state of the modes."""
+    """Return a random attitude, rate and state of the modes as an `AttitudeState`."""
     rng = np.random.default_rng(seed)
     q = rng.normal(size=4)
     modes = flexible_body.Modes(vector(rng.normal(size=4)), vector(rng.normal(size=4)))
@@ -53,7 +53,7 @@ def state(seed):
 
 
 def independent(t, y, torque):
-    """Return the rates of q, w, e and psi = e' + D w, written out in NumPy."""
+    """Return the rates (15,) of q, w, e and psi = e' + D w, written out in NumPy; y: (15,), torque: (3,)."""
     q, w, e, psi = y[:4], y[4:7], y[7:11], y[11:]
     D, W, z = np.array(COUPLING), np.array(FREQUENCY), np.array(DAMPING)
     moved = 2 * z * W * psi + W**2 * e - 2 * z * W * (D @ w)
@@ -66,7 +66,10 @@ def independent(t, y, torque):
 
 @pytest.fixture(scope="module")
 def simulated():
-    """A sampled run of the satellite with steps of 0.025 rad of the fastest mode: their error is about 1e-11."""
+    """Return a sampled run of the satellite with steps of 0.025 rad of the fastest mode.
+
+    The error of these steps is about 1e-11.
+    """
     ready = scenario.study(scenario.from_tables(SATELLITE))
     return runs.simulate(replace(ready, parts=replace(ready.parts, substeps=FINE)))
 
@@ -131,7 +134,7 @@ def test_a_rigid_body_has_no_metrics_of_modes():
 
 
 def energy_of(plant, x):
-    """Return the kinetic and elastic energy, (w'J w + 2 w'D'e' + |e'|^2 + |W e|^2) / 2 [J]."""
+    """Return the kinetic and elastic energy [J], (w'J w + 2 w'D'e' + |e'|^2 + |W e|^2) / 2, of a body."""
     e, rate = x.modes
     kinetic = x.w @ plant.inertia @ x.w + 2.0 * x.w @ (plant.coupling.T @ rate) + rate @ rate
     return (kinetic + jnp.sum((plant.frequency * e) ** 2)) / 2.0

@@ -13,7 +13,7 @@ EPS = np.finfo(float).eps
 
 
 def random_body(seed):
-    """Return the inertia of random point masses, the sum of m (|r|^2 I - r r')."""
+    """Return the inertia (3, 3) of random point masses, the sum of m (|r|^2 I - r r')."""
     points = np.random.default_rng(seed).normal(size=(6, 3)) * [1.0, 2.0, 0.5]
     return sum((r @ r) * np.eye(3) - np.outer(r, r) for r in points)
 

@@ -52,7 +52,7 @@ def spacecraft_as_system(reference, inertia=FULL_INERTIA):
 
 
 def as_system(run, reference):
-    """Return the same run with the spacecraft written as a system: K1 of (29) is half of K1 of (60)."""
+    """Return the parts of the same run with the spacecraft written as a system: K1 of (29) is half of K1 of (60)."""
     model, law = spacecraft_as_system(reference), run.controller
     error, _ = law.kinematics.errors(run.initial, reference(vector(0.0)))
     return replace(
@@ -72,7 +72,10 @@ torque = jax.jit(commanded)
 
 @jax.jit
 def looked_at(model, t, x, u):
-    """Return dF/dx_2, acceleration without force, mass matrix and generalised force of a system."""
+    """Return dF/dx_2, acceleration without force, mass matrix and generalised force of a system.
+
+    x: the state (x_1, x_2). u: input.
+    """
     force = model.generalised_force(t, x, u)
     return model.rate_jacobian(t, x), model.coasting_acceleration(t, x), model.mass(t, x), force
 
@@ -105,7 +108,7 @@ GAINS = {"eta": 3.0, "delta": 0.05, "k1": 1.0, "surface_rate": 1.0, "sign_width"
 
 
 def arm_tables(**changes):
-    """Return the scenario of a two-link arm with changes in its tables."""
+    """Return the tables of a scenario of a two-link arm; changes: {table: changed keys}."""
     tables = {
         "plant": {"kind": "system", "system": ARM, "x0": [0.8, -1.0, 0.5, 0.2]},
         "controller": {"t_f": 3.0, **GAINS, "disturbance_rate_bound": 0.6, "disturbance_bound": 0.45},
@@ -175,7 +178,7 @@ def test_a_run_that_meets_a_singular_input_gain_is_marked_with_the_time(mode):
 
 
 def no_linear_rate(t, x_1, x_2):
-    """Return x_1' of a system that is not linear in x_2."""
+    """Return x_1' (m,) of a system that is not linear in x_2."""
     return jnp.sinh(x_2) - 0.1 * jnp.sin(t) + 0.2 * x_1[::-1]
 
 
@@ -299,7 +302,7 @@ def test_replace_and_repeated_reading_keep_the_same_custom_system(tmp_path: Path
 
 
 def study(system, x0, **tables):
-    """Return the study of a custom system with this initial state."""
+    """Return the study of a custom system with this initial state; system: the object."""
     return scenario.study(scenario.from_tables({"plant": {"kind": "system", "system": system, "x0": x0}, **tables}))
 
 

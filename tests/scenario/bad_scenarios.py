@@ -14,7 +14,10 @@ CUSTOM = 'plant = { kind = "system", system = "%s" }'
 
 
 def _read():
-    """Yield each scenario of bad_scenarios.txt with the expected parts of its error message."""
+    """Yield (text, of_what, allowed) for each scenario of bad_scenarios.txt.
+
+    of_what, allowed: expected parts of its error message, the key with its value and the allowed values.
+    """
     blocks = Path(__file__).with_suffix(".txt").read_text(encoding="utf-8").split("\n\n")
     for block in blocks:
         *lines, of_what, allowed = (line for line in block.splitlines() if not line.startswith("# "))
@@ -56,7 +59,10 @@ JARGON = re.compile(r"\n|Traceback|Error|Errno|could not convert|array element|n
 
 
 def check_sentence(said, of_what, allowed):
-    """Assert that an error message is one sentence that names the key, its value and the allowed values."""
+    """Assert that an error message is one sentence that names the key, its value and the allowed values.
+
+    said: the message. of_what: text with the key and its value. allowed: text with the allowed values.
+    """
     assert of_what in said
     assert allowed in said
     assert not JARGON.search(said)

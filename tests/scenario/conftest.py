@@ -7,7 +7,7 @@ from ptsmc_jax.scenario import systems
 
 @pytest.fixture
 def here(tmp_path, monkeypatch, request):
-    """An empty folder with the `FILES` of the test module; no custom file counts as run yet."""
+    """Change to an empty folder with the `FILES` of the test module; return it. No custom file counts as run yet."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(systems, "_executed_files", {})
     for name, text in request.module.FILES.items():

@@ -20,7 +20,7 @@ def key_of(line):
 
 
 def blocks(text):
-    """Return the lines with keys of each table, without the introduction of the file. [[sensors]] is "[sensors]"."""
+    """Return {table: lines with keys}, without the introduction of the file. [[sensors]] is "[sensors]"."""
     found, name = {}, None
     for line in text.splitlines():
         if match := TABLE.match(line):
@@ -32,7 +32,10 @@ def blocks(text):
 
 
 def kinds(lines):
-    """Return the lines of each kind of a table, the active kind first. A table without kinds has one list of lines."""
+    """Return a list with the lines of each kind of a table, the active kind first.
+
+    A table without kinds has one list of lines.
+    """
     found = [[]]
     for line in lines:
         if key_of(line) == "kind" and found[-1]:
@@ -42,12 +45,12 @@ def kinds(lines):
 
 
 def values(lines):
-    """Return the values of the keys of lines, also in comments. The last line of a key counts."""
+    """Return {key: value} of the keys of lines, also in comments. The last line of a key counts."""
     return {key: value for line in lines for key, value in tomllib.loads(line.removeprefix("#")).items()}
 
 
 def attitudes(lines):
-    """Return the lines with the other keys and one attitude key for each attitude key."""
+    """Return a list for each attitude key: the lines with the other keys and this attitude key."""
     others = [line for line in lines if key_of(line) not in ATTITUDE]
     return [
         [*others, *(line for line in lines if key_of(line) in (key, key == "euler_deg" and "sequence"))]
@@ -56,9 +59,9 @@ def attitudes(lines):
 
 
 def complete(plant):
-    """Return pairs of a table's name and a valid scenario with all keys of one kind of this table.
+    """Return pairs of a table's name and the tables of a valid scenario with all keys of one kind of this table.
 
-    The scenario around the table is sampled and has the noises and limits that dispersions need.
+    plant: its kind. The scenario around the table is sampled and has the noises and limits that dispersions need.
     """
     text = new.scenario_text(plant, {})
     found, written = blocks(text), tomllib.loads(text)

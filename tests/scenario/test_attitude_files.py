@@ -28,7 +28,11 @@ META = {
 
 
 def message(rows, version="1.0", dates=DATES, marks=True, **changed):
-    """Return the text of an attitude ephemeris message; changed: values of its keywords, None removes one."""
+    """Return the text of an attitude ephemeris message.
+
+    rows: quaternions. dates: of the rows. marks: whether to write DATA_START and DATA_STOP. changed: values of its
+    keywords, None removes one.
+    """
     meta = {name: value for name, value in (META | changed).items() if value is not None}
     lines = [f"{name} = {value}" for name, value in meta.items()]
     data = [f"{date} {' '.join(f'{number:.15f}' for number in row)}" for date, row in zip(dates, rows, strict=True)]
@@ -37,7 +41,10 @@ def message(rows, version="1.0", dates=DATES, marks=True, **changed):
 
 
 def write_and_read(path, content, order=None, direction=None, interpolation="file", epoch=None):
-    """Write text or a data frame to a file, and return the attitudes that the program reads from it."""
+    """Write text or a data frame to a file, and return the samples of attitude that the program reads from it.
+
+    order, direction, interpolation, epoch: as in the table [reference].
+    """
     if isinstance(content, str):
         path.write_text(content)
     elif path.suffix == ".parquet":
@@ -48,14 +55,14 @@ def write_and_read(path, content, order=None, direction=None, interpolation="fil
 
 
 def check(samples, quaternions=Q):
-    """Assert that samples of an attitude file have the times `TIMES` and these quaternions."""
+    """Assert that samples of an attitude file have the times `TIMES` and these quaternions (n, 4), scalar last."""
     np.testing.assert_allclose(samples.times, TIMES, atol=1e-9)
     off = Rotation.from_quat(quaternions).inv() * Rotation.from_quat(samples.quaternions)
     assert off.magnitude().max() < 1e-12
 
 
 def columns(names, values):
-    """Return a column of a table for each name, from the columns of an array."""
+    """Return {name: column} from the columns of an array (rows, names)."""
     return dict(zip(names, values.T, strict=True))
 
 

@@ -53,12 +53,12 @@ pytestmark = pytest.mark.usefixtures("here")
 
 
 def made(file, name) -> Any:
-    """Return the object with this name in a file of the test."""
+    """Return the object with this name in a custom file; file: its path."""
     return systems.load_object(f"{file}:{name}", systems.NAME_FORMS)
 
 
 def simulated(tables, record=True):
-    """Return the simulated run of a scenario, with its history by default."""
+    """Return the result of the simulation of a scenario with these tables, with its history by default."""
     return rollout.simulate_parts(scenario.study(scenario.from_tables(tables)).parts, record=record)
 
 

@@ -44,7 +44,10 @@ FOLDER = "out/montecarlo-mine"
 
 
 def reported(place, by="mine.toml"):
-    """Return the line on stderr that names the custom file before a command runs it."""
+    """Return the line on stderr that names the custom file before a command runs it.
+
+    place: folder of the custom file. by: the file that names it.
+    """
     return f"ptsmc: runs {place}/my.py, which plant.system of {by} names\n"
 
 
@@ -56,7 +59,7 @@ def fresh(monkeypatch):
 
 @pytest.fixture(scope="module")
 def places(tmp_path_factory):
-    """Return the path of a folder, and a path for a copy of it."""
+    """Return the path of an existing folder, and a path for a copy of it that does not exist."""
     return tmp_path_factory.mktemp("home"), tmp_path_factory.mktemp("kept") / "home"
 
 
@@ -92,7 +95,7 @@ def simulated(home):
 
 
 def ran(folder):
-    """Return whether my.py has run since the last call."""
+    """Return whether my.py in the folder has run since the last call."""
     marker = folder / "my.ran"
     found = marker.exists()
     marker.unlink(missing_ok=True)
@@ -274,7 +277,10 @@ def test_inconsistent_result_folders_are_refused_in_one_sentence(command, tmp_pa
 
 
 def _tables(*codes):
-    """Return the tables of a scenario that uses these files: the first as its law, the others as disturbances."""
+    """Return the tables of a scenario that uses these files: the first as its law, the others as disturbances.
+
+    codes: "file:name" of each class.
+    """
     laws = [{"kind": "custom", "code": str(code)} for code in codes]
     return {"controller": laws[0], "disturbance": {"terms": laws[1:]}} if laws[1:] else {"controller": laws[0]}
 

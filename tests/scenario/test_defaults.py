@@ -24,20 +24,23 @@ SAMPLED = {"mode": "sampled", "period": 0.1}
 
 
 def free(said):
-    """Return the names of the free gains of a scenario."""
+    """Return the names of the free gains of a scenario with the table [tune]."""
     assert said.tune is not None
     assert said.tune.free is not None
     return said.tune.free
 
 
 def bounds(**tables):
-    """Return the default bounds of the disturbance and of its rate in a scenario."""
+    """Return the default bounds of the disturbance and of its rate in a scenario with these tables."""
     law = reading.complete(scenario.from_tables(tables)).controller
     return law.disturbance_bound, law.disturbance_rate_bound
 
 
 def reached(disturbance, dispersion=None, count=400, spacecraft=None):
-    """Return the largest component of d and of d' over random times, phases and factors, by finite differences."""
+    """Return the largest component of d and of d' over random times, phases and factors, by finite differences.
+
+    disturbance, dispersion, spacecraft: tables of the scenario. count: number of trials.
+    """
     tables = {"disturbance": disturbance, "dispersion": dispersion or {}, "spacecraft": spacecraft or {}}
     ready = scenario.study(scenario.from_tables(tables))
     t = np.linspace(0.0, 40.0, 8001)

@@ -84,7 +84,7 @@ def test_the_default_settling_angle_follows_the_start_and_the_noise(tables, angl
 
 
 def sampled(**tables: Any) -> Any:
-    """Return a sampled scenario of a body of 50 kg m^2 that turns in 100 s."""
+    """Return a sampled scenario of a body of 50 kg m^2 that turns in 100 s; tables replace its tables."""
     base = {"spacecraft": {"inertia": [40.0, 50.0, 60.0]}, "controller": {"t_f": 100.0},
             "loop": {"mode": "sampled", "period": 0.25}, "disturbance": {"kind": "none"}}  # fmt: skip
     return scenario.from_tables({**base, **tables})

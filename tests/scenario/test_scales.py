@@ -22,12 +22,15 @@ ARM = {"plant": {"kind": "system", "system": second_order.system(
 
 
 def noise_of_s(known):
-    """Return the predicted noise of s, 1 sigma, in a scenario."""
+    """Return the predicted noise of s, 1 sigma, in a scenario, in the units of s."""
     return known.devices.noise_of_s(known)
 
 
 def flight(**changes):
-    """Return the scenario first_flight.toml with changes and without its table [tune]."""
+    """Return the scenario first_flight.toml with changes and without its table [tune].
+
+    changes: as for `scenario.replace`.
+    """
     return scenario.replace(scenario.read(FIRST_FLIGHT), tune=None, **changes)
 
 
@@ -44,7 +47,7 @@ def test_the_deadbeat_gain_leaves_the_documented_fraction_of_the_slowest_error(i
 def growth(c, k, late, keep=0.6, period=1.0):
     """Return the logarithm of the growth per period of one axis under the sampled law in the hold phase.
 
-    The loop has a delay of whole periods and the digital observer.
+    c: slope of the surface. k: reaching rate. late: delay in whole periods. keep: pole of the digital observer.
     """
     state, estimate = np.array([1.0, 0.3]), 0.0
     commands, sizes = [0.0] * late, []

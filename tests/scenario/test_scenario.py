@@ -161,7 +161,7 @@ ROUNDING = 1e-14
 
 
 def attitude_of(scenario, table):
-    """Return the quaternion of the attitude in the table "initial" or "reference"."""
+    """Return the quaternion (4,), scalar last, of the attitude in the table "initial" or "reference"."""
     return quaternion(getattr(scenario, table), table)
 
 
@@ -176,7 +176,10 @@ def test_attitude_keys_give_the_quaternions_computed_by_hand(table, said, expect
 
 
 def every_parametrisation(rotation):
-    """Return all attitude keys of a file for the rotation from body to inertial vectors, computed by NumPy."""
+    """Yield a table with the keys of each parametrisation of an attitude, computed by NumPy.
+
+    rotation: from body to inertial vectors, a `Rotation`.
+    """
     matrix = rotation.as_matrix()
     vector = rotation.as_rotvec()
     angle = np.linalg.norm(vector)
@@ -204,7 +207,7 @@ def test_every_attitude_key_gives_the_same_attitude(seed):
 
 
 def plain(value):
-    """Return an array as a list."""
+    """Return an array as a list, nested like the array."""
     return np.asarray(value).tolist()
 
 

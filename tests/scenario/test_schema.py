@@ -121,14 +121,14 @@ def leaves(tables, path=()):
 
 
 def value_at(tables, path):
-    """Return the value at a path in nested tables."""
+    """Return the value at a path in nested tables; path: keys and indices."""
     for key in path:
         tables = tables[key]
     return tables
 
 
 def changed(tables, path, value):
-    """Return the tables with a new value at a path."""
+    """Return a copy of the tables with a new value at a path of keys and indices."""
     tables = copy.deepcopy(tables)
     value_at(tables, path[:-1])[path[-1]] = value
     return tables
@@ -141,7 +141,10 @@ def key_of(path):
 
 
 def at_each(wanted, scenarios=BUILT_IN):
-    """Return the scenarios with the path of each wanted value of their table."""
+    """Return (tables, path) for each value of each scenario's table for which `wanted(path, value)` is true.
+
+    scenarios: pairs of the name of a table and the tables of a scenario.
+    """
     return [
         (tables, (name, *path))
         for name, tables in scenarios

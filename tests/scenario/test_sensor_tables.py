@@ -24,7 +24,7 @@ LOOP = {"mode": "sampled", "period": 0.1}
 
 
 def read(*sensors, **tables):
-    """Return the scenario with these tables [[sensors]]."""
+    """Return the scenario with these tables [[sensors]] and other tables."""
     return scenario.from_tables({"loop": LOOP, "sensors": list(sensors), **tables})
 
 
@@ -102,7 +102,7 @@ class Level(ptsmc.AttitudeSensor):
         return self.scale * attitude.rotate(q, self.direction())[:1]
 
     def direction(self):
-        """Return the sensor's z axis in body axes."""
+        """Return the sensor's z axis (3,) in body axes."""
         return attitude.rotate(self.mounting, jnp.array([0.0, 0.0, 1.0]))
 
 

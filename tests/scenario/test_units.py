@@ -106,7 +106,7 @@ MISSIONS = {
 
 
 def flat(tables: Any, path: str = "") -> dict[str, Any]:
-    """Return the numbers of nested tables by their path."""
+    """Return the values of nested tables by their path, such as ".loop.period" or ".initial.rate[0]"."""
     if isinstance(tables, Mapping):
         return {k: v for key, one in tables.items() for k, v in flat(one, f"{path}.{key}").items()}
     if isinstance(tables, list | tuple):

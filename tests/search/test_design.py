@@ -24,7 +24,7 @@ CASE = {
 
 
 def largest(tables, t_f, trials):
-    """Return the largest peak torque [N m] of trials with this t_f [s]."""
+    """Return the largest peak torque [N m] of `trials` trials with this t_f [s]; tables: of the scenario."""
     tables = {
         **tables,
         "controller": {**tables["controller"], "t_f": t_f},

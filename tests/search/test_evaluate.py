@@ -20,7 +20,11 @@ from tuning.search.objective import FAILED, Rules, judge, problem
 
 
 def with_margins(monkeypatch, simulated, of_loop, objective):
-    """Return the measurement at two points whose metrics have these constraints, and whose margins have those."""
+    """Return the measurement with gradients at two points.
+
+    simulated, of_loop: {"c": (2, rows, trials), "c_gradient": (2, rows, trials, gains)} of the metrics and of the
+    margins. objective: its name.
+    """
     monkeypatch.setattr(evaluate.margin_rows, "constraints_at_points", lambda margins, scale, normalised: of_loop)
     some: Any = SimpleNamespace(margins=object(), objective=objective)
     evaluator, at = Evaluator(Bounds(("eta", "delta"), (2.0, 0.1), (3.0, 1.0))), np.array([[0.0, 0.0], [1.0, 1.0]])

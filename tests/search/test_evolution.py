@@ -16,7 +16,8 @@ from tuning.search.normalisation import Bounds
 class Quadratic(Evaluator):
     """F = x'A x subject to a'x >= b, with x the normalised gains less 0.5.
 
-    F is NaN if the first element of x exceeds `wall`. If it is below `lost`, a trial fails that does not count in F.
+    matrix, along, least: A, a and b; without a, there is no limit. F is NaN if the first element of x exceeds `wall`.
+    If it is below `lost`, a trial fails that does not count in F.
     """
 
     def __init__(self, matrix, along=None, least=0.0, wall=1.0, lost=-1.0):
@@ -36,7 +37,10 @@ class Quadratic(Evaluator):
 
 
 def refined(evaluator, start, seed=3, size=evolution.WHOLE_BOX):
-    """Run differential evolution from a point x; return the best point and the calls of the progress report."""
+    """Run differential evolution from a point x; return the best point and the calls of the progress report.
+
+    size: number of points and their standard deviation (inf: whole box).
+    """
     names = evaluator.bounds.names
     some = objective.problem(parts(20.0, 3.0, 1.0), TURNED, 0, np.arange(1), names, [Requirement("peak_torque", 1.0)])
     normalised = 0.5 + np.asarray(start)
@@ -49,7 +53,7 @@ def refined(evaluator, start, seed=3, size=evolution.WHOLE_BOX):
 
 
 def ill_conditioned(count):
-    """Return a rotated symmetric matrix with eigenvalues from 1 to 400."""
+    """Return a rotated symmetric matrix (count, count) with eigenvalues from 1 to 400."""
     turn, _ = np.linalg.qr(np.random.default_rng(7).normal(size=(count, count)))
     return turn @ np.diag(np.geomspace(1.0, 400.0, count)) @ turn.T
 

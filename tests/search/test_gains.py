@@ -56,7 +56,10 @@ OTHERS = {
 
 
 def wide(tables=None):
-    """Return the scenario and its parts, with a clock that has samples for all gains within their bounds."""
+    """Return a scenario and its study, with a clock that has samples for all gains within their bounds.
+
+    tables: of the scenario, beside `BASE`.
+    """
     scenario = from_tables({**BASE, "tune": TUNED, **(tables or {})})
     return scenario, posing.set_up_tuning(scenario, 0).ready
 
@@ -189,13 +192,13 @@ SAMPLED = {"mode": "sampled"}
 
 
 def filtered(interval):
-    """Return a scenario with an attitude filter and this period of the star tracker [s]."""
+    """Return the tables of a scenario with an attitude filter and this period of the star tracker [s]."""
     hardware = {"attitude_noise": 2e-5, "rate_noise": 1e-6, "star_tracker_period": interval}
     return {"loop": {**SAMPLED, "period": 0.1}, "hardware": hardware, "filter": {"bandwidth": 0.5}}
 
 
 def timed(t_f, **gains):
-    """Return a scenario with this t_f [s] and these gains of the law."""
+    """Return the tables of a scenario with this t_f [s] and these gains of the law."""
     return {"controller": {"t_f": t_f, **gains}}
 
 

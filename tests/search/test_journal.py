@@ -7,7 +7,10 @@ from tuning.search.journal import Journal
 
 
 def ask(journal, count, asked):
-    """Return the answers to `count` questions. `asked` collects the indices of the computed answers."""
+    """Return a list of the answers to `count` questions.
+
+    asked: a list that receives the indices of the computed answers.
+    """
 
     def compute(k):
         asked.append(k)

@@ -96,7 +96,7 @@ def test_hand_over_is_moved_to_samples_by_t_f_if_delta_is_not_free():
 class Conflicting(Evaluator):
     """F = x0, with the limits c = 2 (a - x0) + y and c = x0 - b + y, and a constant limit; y = (x1 - 0.3)^2.
 
-    The first two limits are equally far exceeded at x0 = (2 a + b) / 3.
+    third: value of the constant limit. The first two limits are equally far exceeded at x0 = (2 a + b) / 3.
     """
 
     def __init__(self, a, b, third):
@@ -167,7 +167,10 @@ def test_a_search_starts_from_the_best_design_if_that_is_better_than_the_scenari
 
 
 class OfDelta(Evaluator):
-    """Evaluates F and the largest c of every trial, which are functions of delta."""
+    """Evaluates F and the largest c of every trial, which are functions of delta.
+
+    f_and_c: function of delta [s] that returns F and c.
+    """
 
     def __init__(self, f_and_c):
         super().__init__(normalisation.Bounds(("delta",), (0.2,), (5.0,)))
@@ -190,7 +193,7 @@ class OfDelta(Evaluator):
 
 
 def narrow(delta):
-    """Return (delta - 1.1)^2 for delta < 2, else 1 + (delta - 3.5)^2, and c, without its derivative.
+    """Return F and c: (delta - 1.1)^2 for delta < 2, else 1 + (delta - 3.5)^2, and c without its derivative.
 
     The period is 0.2 s. If delta < 2, the limit is broken within 0.3 periods of each sample.
     """
@@ -210,7 +213,7 @@ def test_another_local_search_is_used_if_the_hand_over_on_a_sample_breaks_a_limi
 
 
 def rippled(delta):
-    """Return a parabola with ripples of period 0.6 s, and the limit c = 1.7 s - delta."""
+    """Return F and c: a parabola with ripples of period 0.6 s, and the limit c = 1.7 s - delta."""
     return 0.02 * (delta - 1.8) ** 2 + 0.01 * (1.0 - jnp.cos(2.0 * jnp.pi / 0.6 * delta)), 1.7 - delta
 
 

@@ -10,7 +10,7 @@ from tuning.search.lockstep import run_in_lockstep
 
 
 def counting(upto, found, name):
-    """Return a function that requests answers to 1, 2, .., `upto` and stores them in `found`."""
+    """Return a function of `ask` that requests answers to 1, 2, .., `upto` and stores them in the list found[name]."""
 
     def work(ask):
         for k in range(1, upto + 1):

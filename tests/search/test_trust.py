@@ -24,7 +24,10 @@ BOUNDS = Bounds(("eta", "delta", "t_f"), (2.5, 0.3, 15.0), (5.0, 4.0, 25.0))
 
 
 def moved_in_time(**limits):
-    """Return a double integrator with noise. Its clock covers all of `BOUNDS`, so that tests share one program."""
+    """Return a problem of a double integrator with noise.
+
+    limits: of metrics. Its clock covers all of `BOUNDS`, so that tests share one program.
+    """
     noisy = problem(**limits)
     far = replace(noisy.parts, clock=replace(clock.anchored_clock(0.2, 21.0), count=140))
     return replace(noisy, parts=far, names=BOUNDS.names)
@@ -229,7 +232,10 @@ class OneLimit:
 
 
 class Steps:
-    """Evaluates F = 3 + normalised gain, infinite above 0.9, and a given c. It counts the points with margins."""
+    """Evaluates F = 3 + normalised gain, infinite above 0.9, and a given c. It counts the points with margins.
+
+    c: function of the problem and the normalised gains.
+    """
 
     def __init__(self, c):
         self.c, self.rollouts, self.judged = c, 0, 0

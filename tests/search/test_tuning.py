@@ -50,7 +50,10 @@ def short_rows(monkeypatch):
 
 @pytest.fixture(scope="module", params=helpers.short(["chain", "spacecraft"], ["chain"]))
 def loss(request):
-    """Return ln RMS window error of 6 noisy trials as a function of (eta, delta, l, t_f), and its derivative."""
+    """Return two functions of (eta, delta, observer gain, t_f).
+
+    They return ln RMS window error of 6 noisy trials, and its derivative (4,).
+    """
     if request.param == "chain":
         model, wave = integrator_chain.chain(2), disturbances.Sinusoid(*(vector([v]) for v in (0.01, 0.1, 0.0, 0.0)))
         observer = nonlinear.NonlinearObserver(model, vector([10.0]), vector(1e-3), vector(0.0))
@@ -74,7 +77,7 @@ def loss(request):
 
 
 def central(value, at, k, h):
-    """Return the fourth-order central finite difference along one gain."""
+    """Return the fourth-order central finite difference of `value` along gain k; h: step."""
     steps = np.eye(at.size)[k] * h
     f = [float(value(jnp.asarray(at + n * steps))) for n in (-2, -1, 1, 2)]
     return (f[0] - 8 * f[1] + 8 * f[2] - f[3]) / (12 * h)
@@ -178,9 +181,10 @@ FAR_OFF = dict.fromkeys(("peak_torque", "effort", "window_error"), 1e9)  # limit
 
 
 def problem(count=8, dispersion=SPREAD, may_break=None, **limits):
-    """Return a problem of a double integrator, or of the spacecraft if initial attitudes are dispersed.
+    """Return a tuning problem of a double integrator, or of the spacecraft if initial attitudes are dispersed.
 
-    Limits that are not given are out of reach, so that one program serves all tests.
+    count: number of trials. may_break: number of trials that may break the first limit. limits: of metrics; limits that
+    are not given are out of reach, so that one program serves all tests.
     """
     if "initial_attitude" not in dispersion.kinds:
         run = chain_parts([25.0, 0.0], 20.0, 3.0, 0.5, period=0.2, noise=[5e-4, 2.5e-5])
@@ -193,7 +197,7 @@ def problem(count=8, dispersion=SPREAD, may_break=None, **limits):
 
 
 def evaluated_at(some, *gains):
-    """Return F, c and the logarithm of the objective at these gains, as `Evaluator` computes them."""
+    """Return F, c (rows, trials) and the logarithm of the objective at these gains, as `Evaluator` computes them."""
     found = Evaluator(WITHIN).measure(some, WITHIN.normalise(np.asarray(gains))[None])
     return found.f[0], found.c[0], found.value[0]
 
@@ -218,7 +222,7 @@ def test_repeated_trials_are_simulated_and_counted_once():
 
 
 def simulated_at(some, trials, *gains):
-    """Return the metrics of these trials."""
+    """Return the metrics of these trials of a problem with these gains."""
     return simulations.simulate_trials(some.batch_of(np.asarray(trials)), np.asarray(gains)).metrics
 
 
@@ -261,7 +265,7 @@ def test_a_quantile_limit_is_a_limit_on_an_order_statistic(least):
 
 @programs.jit
 def backwards(some, at):
-    """Return the gradients of F and of the largest c with respect to the gains, in reverse mode."""
+    """Return the gradients of F and of the largest c with respect to the gains (2, gains), in reverse mode."""
 
     def value(at):
         f, c, _ = objective.measure(some, at)

@@ -25,7 +25,7 @@ FAR = dict.fromkeys(("peak_torque", "peak_rate", "effort", "settling_time"), 1e9
 
 
 def posed(dispersion, requirement=None, settling_angle=4.0, **others):
-    """Return a problem without noise or disturbance, from rest to the identity attitude.
+    """Return a problem without noise or disturbance, from rest to the identity attitude, and its requirements.
 
     All limits of `FAR` are added, so that the tests share programs. By default, the run counts as settled from the
     start.
@@ -121,10 +121,11 @@ EDGE = 0.02  # largest actuator scale factor error
 
 
 def swinging(x0, std, amplitude, settling_angle=1e9, **limits):
-    """Return a problem of a chain with dispersions of the initial state, disturbance phase and two hardware errors.
+    """Return a problem of a chain with dispersions, and its requirements.
 
-    The initial state is normal with the standard deviations `std` (2,). Limits that are not given are out of reach. By
-    default, the run counts as settled from the start.
+    The dispersions are the initial state, the disturbance phase and two hardware errors. The initial state is normal
+    about (x0, 0) with the standard deviations `std` (2,). Limits that are not given are out of reach. By default, the
+    run counts as settled from the start. amplitude: of the disturbance.
     """
     acting = disturbances.Sinusoid(*(vector([v]) for v in (amplitude, 0.1, 0.0, 0.0)))
     run = chain_parts([x0, 0.0], T_F, ETA, 1.0, period=0.2, disturbance=acting)

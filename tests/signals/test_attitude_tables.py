@@ -19,19 +19,19 @@ UNEVEN = np.array([0.0, 0.7, 1.0, 2.5, 2.9, 4.0, 7.0, 7.2, 9.0])
 
 
 def wander(times):
-    """Return attitudes (n, 4) of a body that turns about a moving axis, at times [s]."""
+    """Return attitudes (n, 4), scalar last, of a body that turns about a moving axis, at times (n,) [s]."""
     return Rotation.from_rotvec(
         np.stack([0.8 * np.sin(0.3 * times), 0.1 * times, np.cos(0.2 * times)], axis=1)
     ).as_quat()
 
 
 def at(reference, times) -> Any:
-    """Return attitude, rate and acceleration of a reference at times [s], as arrays."""
+    """Return attitude, rate and acceleration of a reference at times (n,) [s], as a `Target` of arrays."""
     return jax.tree.map(np.asarray, lapack.vmap(reference)(jnp.asarray(times)))
 
 
 def apart(q, p):
-    """Return the rotation angles [rad] between quaternions."""
+    """Return the rotation angles (n,) [rad] between quaternions (n, 4)."""
     return (Rotation.from_quat(q).inv() * Rotation.from_quat(p)).magnitude()
 
 

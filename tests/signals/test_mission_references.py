@@ -36,7 +36,7 @@ def build_reference(table, orbit=ORBIT, **others):
 
 
 def state(t, orbit=ORBIT):
-    """Return position [m], velocity and acceleration on an orbit in inertial axes, computed by NumPy."""
+    """Return position [m], velocity and acceleration, (3,) each, on an orbit in inertial axes, computed by NumPy."""
     a, e, f_0 = orbit["semi_major_axis"], orbit["eccentricity"], orbit["true_anomaly"]
     e_0 = 2.0 * np.arctan(np.sqrt((1.0 - e) / (1.0 + e)) * np.tan(f_0 / 2.0))
     mean = e_0 - e * np.sin(e_0) + np.sqrt(MU / a**3) * t
@@ -55,9 +55,9 @@ def unit_rate(p, p_dot):
 
 
 def frame(first, second):
-    """Return the rotation matrix of a body whose axes `AXES` follow two directions, and its rate in body axes.
+    """Return the rotation matrix of a body whose axes `AXES` follow two directions, and its rate in body axes [rad/s].
 
-    Each direction is a vector and its derivative.
+    first, second: each a vector and its derivative.
     """
     (p, p_dot), (s, s_dot) = unit_rate(*first), second
     n, n_dot = unit_rate(np.cross(p, s), np.cross(p_dot, s) + np.cross(p, s_dot))
@@ -73,7 +73,7 @@ def frame(first, second):
 
 
 def ground(t):
-    """Return the vector from the spacecraft to the ground target, and its derivative."""
+    """Return the vector (3,) from the spacecraft to the ground target [m], and its derivative; t [s]."""
     a, f = 6378137.0, 1.0 / 298.257223563
     latitude, longitude, h = np.deg2rad(12.0), np.deg2rad(-25.0), 250.0
     n = a / np.sqrt(1.0 - f * (2.0 - f) * np.sin(latitude) ** 2)
@@ -85,13 +85,13 @@ def ground(t):
 
 
 def nadir(t):
-    """Return the vector from the spacecraft to the centre of the Earth, and its derivative."""
+    """Return the vector (3,) from the spacecraft to the centre of the Earth [m], and its derivative; t [s]."""
     r, v, _ = state(t)
     return -r, -v
 
 
 def velocity(t):
-    """Return the velocity of the spacecraft, and its derivative."""
+    """Return the velocity (3,) of the spacecraft [m/s], and its derivative; t [s]."""
     _, v, a = state(t)
     return v, a
 

@@ -89,7 +89,7 @@ def test_sinusoid_and_its_time_derivative_equal_closed_forms():
 
 
 def body_rate(r, r_dot):
-    """Return the body rate of exp(r): the right Jacobian of SO(3) times r' (Chirikjian 2011, eq. 10.86)."""
+    """Return the body rate (3,) of exp(r): the right Jacobian of SO(3) times r' (Chirikjian 2011, eq. 10.86)."""
     zero = jnp.zeros(())
     x = jnp.stack([jnp.stack(row) for row in ([zero, -r[2], r[1]], [r[2], zero, -r[0]], [-r[1], r[0], zero])])
     angle = jnp.sqrt(r @ r)

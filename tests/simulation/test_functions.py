@@ -43,11 +43,11 @@ class Push:
     """A callable that is not a pytree."""
 
     def __call__(self, t, x):
-        """Return the wave for a chain."""
+        """Return the wave of amplitude 0.1 for a chain (1,)."""
         return self.wave(0.1, t, x)
 
     def wave(self, size, t, x):
-        """Return a wave of any size."""
+        """Return a wave (1,) of the amplitude `size`."""
         return size * jnp.sin(t) * jnp.ones(1)
 
 

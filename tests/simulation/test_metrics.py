@@ -27,7 +27,7 @@ from tests.helpers import chain_flight, chain_parts, fly, parts, short, vector
 
 
 def simulated(**changes):
-    """Return the parts of a run, its metrics, and the rows of its history without periods of length zero."""
+    """Return the parts of a run, its metrics, and its history without periods of length zero; changes: of the parts."""
     run = parts(20.0, 3.0, 0.5, **changes)
     result = fly(run, 1, 4)
     log = result.log
@@ -120,7 +120,10 @@ def test_settling_time_matches_the_history(run):
 
 
 def interval(t, t_next, angles, torque=0.0, delivered=None):
-    """Return an interval of a run with the angles [rad] at both ends, and torques about x [N m]."""
+    """Return an interval of a run with the angles [rad] at both ends, and torques about x [N m].
+
+    t, t_next: its ends [s]. delivered: by default the commanded torque.
+    """
     start, end = (Snapshot(vector(a), vector(a), vector(a)) for a in angles)
     u = vector([torque, 0.0, 0.0])
     got = u if delivered is None else vector([delivered, 0.0, 0.0])
@@ -185,7 +188,10 @@ def test_angles_after_t_f_use_a_parabola_through_their_squares():
 
 
 def part(squares, begin, end):
-    """Return the integral over part of an interval from 2 to 2.5 s, between two fractions of it."""
+    """Return the integral over part of an interval from 2 to 2.5 s, between the fractions `begin` and `end` of it.
+
+    squares: of the error at the nodes of the interval.
+    """
     times = (2.0 + 0.5 * begin, 9.0, 0.5 * (end - begin), 0.1)
     return integral_in_window(vector(2.0), vector(2.5), squares, Criteria(*map(vector, times)))
 

@@ -20,10 +20,10 @@ SLACK = 1.0 / np.cos(0.5 * np.pi / pointing.DIRECTIONS)  # upper bound of comput
 
 
 def brute_force(t, error, mean_of, begins, window, t_end, limits: Any = None) -> Any:
-    """Return the indices (4,) about x, y, z and of the half-cone, from errors (n, 5) at times t (n,).
+    """Return {index: values (4,) about x, y, z and of the half-cone} from errors (n, 5) at times t (n,).
 
-    `mean_of` returns the mean error between two times. With limits (4,), the result is the fraction of windows whose
-    means are within the limits.
+    `mean_of` returns the mean error between two times. begins, window, t_end [s]. With limits (4,), the result is an
+    array (4,), the fraction of windows whose means are within the limits.
     """
     count = int((t_end - begins) / window + 1e-9)
     interpolated = mean_of("at")
@@ -54,7 +54,10 @@ def of_spline(spline):
 
 
 def close(found, expected, rel):
-    """Assert equality, except that half-cones of deviations may be up to 0.5 % too large."""
+    """Assert that found indices equal the expected ones.
+
+    Half-cones of deviations may be up to 0.5 % too large. rel: relative tolerance.
+    """
     for index, values in expected.items():
         np.testing.assert_allclose(found[index][:3], values[:3], rtol=rel, atol=1e-15, err_msg=index)
         ratio = found[index][3] / values[3]
@@ -63,9 +66,10 @@ def close(found, expected, rel):
 
 
 def relative_share(t, error, mean_of, begins, window, t_end, limits) -> Any:
-    """Return the fraction of the time in whole windows in which the error minus its mean is within limits (4,).
+    """Return the fraction (4,) of the time in whole windows in which the error minus its mean is within limits (4,).
 
-    Magnitudes are linear between nodes, and the ends of windows count as nodes.
+    Magnitudes are linear between nodes, and the ends of windows count as nodes. The other arguments are those of
+    `brute_force`.
     """
     count, shares = int((t_end - begins) / window + 1e-9), []
     for k in range(count):
@@ -81,7 +85,7 @@ def relative_share(t, error, mean_of, begins, window, t_end, limits) -> Any:
 
 @programs.jit(static_argnames="segments")
 def tallied(nodes, error, rate, begins, window, limits, segments=33):
-    """Return the accumulated pointing indices of errors (n, 5) with their rates at nodes (n,)."""
+    """Return the tally of pointing indices of errors (n, 5) with their rates at nodes (n,) [s]."""
 
     def step(tally, row):
         t, t_next, start, start_rate, end, end_rate = row
@@ -93,7 +97,7 @@ def tallied(nodes, error, rate, begins, window, limits, segments=33):
 
 
 def indices(tally):
-    """Return the pointing indices of a tally by name, each about x, y, z and of the half-cone."""
+    """Return the pointing indices of a tally by name, each (4,) about x, y, z and of the half-cone."""
     return {"ape": tally.largest, "mpe": tally.mean, "rpe": tally.relative, "pde": pointing.drift(tally)}
 
 
@@ -152,7 +156,7 @@ def test_relative_error_is_zero_for_a_constant_error_and_half_the_rise_of_a_ramp
 
 @programs.jit
 def held(nodes, error, begins, window):
-    """Return the accumulated pointing indices of errors (n, 5), each held from a node to the next node."""
+    """Return the tally of pointing indices of errors (n - 1, 5), each held from a node to the next of nodes (n,)."""
 
     def step(tally, row):
         t, t_next, value = row
@@ -228,7 +232,7 @@ rke_x = { limit = 1e-5, probability = 0.95, interpretation = "mixed" }
 
 @pytest.fixture(scope="module")
 def simulated():
-    """Return the study of a run with pointing requirements, and its result."""
+    """Return the study of a run with pointing requirements, and its result with its history."""
     tables = untuned(POINTED)
     tables["loop"] |= {"clock": "flight"}
     ready = scenario.study(scenario.from_tables(tables))

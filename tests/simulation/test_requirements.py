@@ -12,7 +12,7 @@ BEYOND = np.nextafter(LIMIT, 1.0)
 
 
 def verdict(values, ok=None, metric="peak_torque"):
-    """Return the verdict on the values of trials by a limit of 0.5; ok: False for a failed trial."""
+    """Return the verdict on the values of trials by a limit of 0.5; ok: (trials,), False for a failed trial."""
     values = np.asarray(values, dtype=float)
     return Requirement(metric, LIMIT).verdict(values, np.ones(values.shape, bool) if ok is None else np.asarray(ok))
 
@@ -177,7 +177,11 @@ INDEX = "ape_boresight"
 
 
 def of_time(interpretation, within, probability=0.9973, confidence=None, ok=None, values=None):
-    """Return the verdict on a fraction of time; within: fraction of time in which each run keeps the limit."""
+    """Return the verdict on a fraction of time.
+
+    within: fraction of time in which each run keeps the limit. probability, confidence: of the requirement. ok: False
+    for a failed run. values: the index of each run.
+    """
     within = np.asarray(within, dtype=float)
     asked = Requirement(INDEX, 1e-3, "rad", probability, confidence, interpretation=interpretation)
     assert asked.timed == f"within_{INDEX}"

@@ -34,13 +34,19 @@ TIGHT = clock.anchored_clock(0.25, 30.0)
 
 
 def at_20_hz(*gains) -> rollout.Parts:
-    """Return a run at 20 Hz that uses the compiled program of runs at up to 100 Hz."""
+    """Return the parts of a run at 20 Hz that uses the compiled program of runs at up to 100 Hz.
+
+    gains: t_f, eta, delta and the observer's gain.
+    """
     run = parts(*gains, period=0.05)
     return replace(run, clock=run.clock.long_enough_for([parts(20.0, 3.0, 2.0, period=0.01).clock]))
 
 
 def perfect(run: rollout.Parts) -> rollout.Parts:
-    """Remove disturbance and K2, so that d_hat = 0 is a perfect estimate and exact solution 1 applies."""
+    """Return the parts without disturbance and with K2 = 0.
+
+    Then d_hat = 0 is a perfect estimate and exact solution 1 applies.
+    """
     quiet = disturbances.Constant(jnp.zeros(3))
     bound = replace(run.observer, disturbance_rate_bound=vector(0.0))
     return replace(run, disturbance=quiet, observer=bound)
@@ -244,7 +250,7 @@ def test_runs_that_did_not_converge_have_finished():
 
 
 def simulated(plant, mode, **tables):
-    """Simulate a scenario with this plant, mode of the loop and other tables."""
+    """Return the result of a simulated scenario with this plant, mode of the loop and other tables."""
     loop = {"mode": mode, "settling_angle": 1e-3}
     return runs.simulate(scenario.study(scenario.from_tables({"plant": plant, "loop": loop, **tables})))
 

@@ -114,7 +114,10 @@ def test_bound_and_margins_of_a_campaign_use_its_first_trials_once(tmp_path, mon
 
 
 def folder_of_figures(monkeypatch, required):
-    """Return a campaign of 20 trials with a requirement, whose rows all have the same numbers."""
+    """Return a fake campaign folder of 20 trials, whose rows all have the same numbers in all metrics.
+
+    required: the metric that has a requirement.
+    """
     error = np.linspace(1e-6, 1e-5, 20)
     frame = pl.DataFrame({
         "trial": np.arange(20), "status": ["ok"] * 20, "initial_angle": error, "window_error": error,

@@ -34,7 +34,7 @@ TABLES = tomllib.loads(SHORT)
 
 
 def tuned(scenario):
-    """Return the table [tune] of a scenario that has one."""
+    """Return the table [tune] of a scenario that must have one."""
     assert scenario.tune is not None
     return scenario.tune
 
@@ -260,7 +260,7 @@ def test_all_laws_have_free_gains_if_t_f_is_minimised():
 
 @pytest.fixture(scope="module")
 def eight():
-    """Return eight simulated trials of a spacecraft."""
+    """Return the `Trials` of eight simulated trials of a spacecraft."""
     ready = scenario.study(judging.on_flight_clock(scenario.from_tables(TABLES)))  # the compiled program of judging
     return montecarlo.run(ready.parts, ready.dispersion, 0, np.arange(8))
 
@@ -301,7 +301,10 @@ def test_statistics_of_a_compared_law_use_its_finished_trials(eight):
 
 
 def rivals(monkeypatch, eight, interrupt=None):
-    """Replace search and judging by functions that record their law and seed; return the list of records."""
+    """Replace search and judging by functions that record their law and seed; return the list of records.
+
+    A record is ("tune" or "judge", law, seed). interrupt: the law whose search is interrupted.
+    """
     asked = []
 
     def tune(posed, seed, told, journal, *, with_checks, tries):
@@ -416,7 +419,7 @@ def test_plain_numbers_of_a_custom_law_cause_a_warning_before_and_after_the_sear
 
 
 def lines_of(summary):
-    """Return the sentences of the report of this comparison."""
+    """Return a list of the sentences on gains in the report of a comparison with this summary."""
     return list(compare_report.gain_lines(summaries.read(summaries.Compare, summary)))
 
 

@@ -49,13 +49,16 @@ def few_together():
 
 
 def parse_map(x, y, text=SHORT):
-    """Return the scenario and the two axes of a map."""
+    """Return the scenario and the two axes of a map; x, y: texts of the options, text: of the scenario."""
     loaded = scenario.from_tables(tomllib.loads(text))
     return loaded, mapping.parse_axis(x, "--x", loaded), mapping.parse_axis(y, "--y", loaded)
 
 
 def simulated(x, y, text=SHORT, trials=6):
-    """Simulate a map with few trials in each cell; return its scenario, its axes and its cells."""
+    """Simulate a map with few trials in each cell; return its scenario, its two axes and its cells.
+
+    x, y: texts of the options. text: of the scenario.
+    """
     loaded, across, up = parse_map(x, y, text)
     return loaded, across, up, mapping.simulate(loaded, across, up, 3, trials, lambda done, total: None).cells
 
@@ -157,7 +160,7 @@ def test_error_for_a_key_of_a_map_without_its_table_names_the_nearest_keys(plant
 
 @pytest.fixture(scope="module")
 def mapped():
-    """Return the simulated map of a chain with two periods and two values of delta."""
+    """Return scenario, axes and cells of the map of a chain with two periods and two values of delta."""
     return simulated("loop.period=0.05:0.2:2", "controller.delta=0.1:0.5:2", CHAIN)
 
 

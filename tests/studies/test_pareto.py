@@ -43,12 +43,12 @@ def test_required_fraction_of_the_peak_torque_counts_failed_trials(lost, largest
 
 
 def point(peak, rms, **others):
-    """Return a point of a front with this peak torque and RMS error."""
+    """Return a point of a Pareto front with this peak torque and RMS error."""
     return front.Point(peak, {}, rms=rms, costs={"peak_torque": peak}, **others)
 
 
 def trials(errors):
-    """Return trials with these window errors. The tests do not use the other metrics."""
+    """Return `Trials` with these window errors. All other metrics have the same values."""
     ok = np.zeros(len(errors), dtype=np.int32)
     metrics = Metrics(dict.fromkeys(CATALOGUE, jnp.asarray(errors)))
     return Trials(np.arange(len(errors)), metrics, ok, np.full(len(errors), np.nan), {})

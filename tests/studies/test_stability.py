@@ -23,7 +23,7 @@ CHAIN = SHORT_CHAIN.replace('mode = "sampled"', 'mode = "sampled"\nclock = "flig
 
 
 def tables(path):
-    """Return the rows of a CSV file."""
+    """Return the rows of a CSV file as a list of dicts of texts."""
     with path.open() as file:
         return list(csv.DictReader(file))
 
@@ -62,7 +62,10 @@ def test_margins_command_writes_table_figures_and_page(command, tmp_path, plant)
 
 
 def of_axes(rows, found, names, seen):
-    """Check the values of each axis and of the worst axis in the table and the summary."""
+    """Check the values of each axis and of the worst axis in the table and the summary.
+
+    rows: of the table. found: the summary. names: of the axes. seen: number of sensors in the summary.
+    """
     hold = [row for row in rows if row["t"] == rows[-1]["t"]]
     assert [row["axis"] for row in hold] == names
     for row in hold:
@@ -170,7 +173,7 @@ def test_inputs_and_measured_signals_of_a_chain_have_names():
 
 
 def at_hand_over(period):
-    """Return a chain with t_f - delta of half a period, and a sample at this time."""
+    """Return the study of a chain whose hand-over is half a period after t = 0, with a sample at this time."""
     tables = {**tomllib.loads(CHAIN), "controller": {"t_f": 5.0, "delta": 5.0 - 0.5 * period}, "tune": {}}
     tables["loop"] |= {"period": period, "clock": "anchored"}
     return scenario.study(scenario.from_tables(tables))
@@ -272,7 +275,10 @@ def test_simulate_does_not_meet_a_required_margin_of_an_open_loop_or_a_failed_ru
 
 
 def blamed_on_no_limit(found, first, limited):
-    """Check the report of a sample that the law ignores; limited: the command saturates at other samples."""
+    """Check the report of a sample that the law ignores.
+
+    found: the summary. first: its entry of the sample. limited: whether the command saturates at other samples.
+    """
     assert (first["open"], first["cut"]) == (["u1"], [])
     assert any(loop["cut"] for loop in (found, *found["before"])) == limited
     lines, left = reported(found).lines, f"{first['time_to_go']:.3g} s to go"

@@ -101,7 +101,7 @@ def test_invalid_options_of_pareto_are_refused(command, tmp_path, options, said)
 
 
 def slew_time(known):
-    """Return the trade of accuracy against a t_f of 20 and of 30 s."""
+    """Return the trade of accuracy against a t_f of 20 and of 30 s; known: the scenario."""
     return trades.SlewTime(known, (20.0, 30.0))
 
 

@@ -36,7 +36,7 @@ def exact_hold(elapsed: Scalar, surface: Float[Array, " roots"], rate: Scalar, x
 
 
 def sliding_bound(parts: Parts, log: Log) -> np.ndarray:
-    """Return a bound on |s|_2 in each row of a history (time,) in the hold phase, which begins with the first row.
+    """Return a bound (time,) on |s|_2 in each row of a history in the hold phase, which begins with the first row.
 
     Each component obeys s_i s_i' <= -k s_i^2 + beta with k = `reaching_rate` and
     beta = (factor of sign(s) in s') * 0.2785 width. With t counted from the first row, this gives

@@ -29,7 +29,10 @@ ROOM, LATE_ROOM = (8, 2, 2), (9, 2, 1)
 
 
 def of(loop, **how):
-    """Return the margins of a loop. Small loops are padded so that one compiled program serves all of them."""
+    """Return the `Margins` of a loop, with one entry for each input or sensor.
+
+    how: arguments of `margins.compute_each`. Small loops are padded so that one compiled program serves all of them.
+    """
     sizes, room = (*loop.seen.shape, len(loop.command)), {0: ROOM, 1: LATE_ROOM}.get(loop.delay)
     if not how and room is not None and np.all(np.array(sizes) <= room):
         loop = larger(loop, *room)
@@ -41,7 +44,10 @@ def of(loop, **how):
 
 @programs.jit
 def with_gradients(loop, way):
-    """Margins of the first input, their derivatives along a direction, and the margins of all inputs."""
+    """Return margins of the first input, their derivatives along a direction, and the `Margins` of all inputs.
+
+    way: a loop, the direction. The margins of the first input are in the order of `margins.FIELDS`.
+    """
 
     def margins_of(loop):
         found = margins.compute(loop)
@@ -51,7 +57,7 @@ def with_gradients(loop, way):
 
 
 def larger(loop, n, k, m):
-    """Return the loop padded with states and inputs that have no effect."""
+    """Return the loop padded with zeros to n states, k sensors and m inputs, which have no effect."""
     sizes = {"a": (n, n), "seen": (n, k), "new": (n, m), "old": (n, m), "command": (m, n), "direct": (m, k),
              "disturbed": (n, m)}  # fmt: skip
 
@@ -64,7 +70,7 @@ def larger(loop, n, k, m):
 
 
 def a_loop(a, b, c):
-    """The discrete loop x' = a x + b u, u = c x with one input, no sensor and a period of 1 s."""
+    """Return the discrete loop x' = a x + b u, u = c x with one input, no sensor and a period of 1 s."""
     n, zero = len(a), jnp.zeros
     push = jnp.tile(jnp.reshape(jnp.asarray(b, float), (n, 1)), (linear.NODES.size, 1, 1))
     c = jnp.reshape(jnp.asarray(c, float), (1, n))
@@ -73,7 +79,7 @@ def a_loop(a, b, c):
 
 
 def held(a, b, c, h=1.0, sensors=False):
-    """The sampled loop of dx/dt = a x + b u with u = c x held for h [s]; sensors: whether they see all of x."""
+    """Return the sampled loop of dx/dt = a x + b u with u = c x held for h [s]; sensors: whether they see all of x."""
     n, m = b.shape
     both = np.vstack([np.hstack([a, b]), np.zeros((m, n + m))])
     spans = [[linalg.expm(both * share * h) for share in (part, 1.0 - part)] for part in linear.NODES]
@@ -88,7 +94,7 @@ INTEGRATORS = np.eye(3, k=1), np.eye(3)[:, 2:], -np.array([[0.027, 0.27, 0.9]]) 
 
 
 def drawn_loop(seed):
-    """Random loop: two damped oscillators or integrators, two inputs, perturbed linear-quadratic feedback."""
+    """Return a random loop: two damped oscillators or integrators, two inputs, perturbed linear-quadratic feedback."""
     rng = np.random.default_rng(seed)
     turns, damping, a = rng.uniform(0.3, 2.8, 2), 10 ** rng.uniform(-3.0, -0.5, 2), np.zeros((4, 4))
     for k, (w, share) in enumerate(zip(turns, damping, strict=True)):
@@ -105,7 +111,7 @@ def drawn_loop(seed):
 
 
 def radius_late(loop, axis, late):
-    """Spectral radius of a loop without delay if one axis is delayed by `late` periods."""
+    """Return the spectral radius of a loop without delay if input `axis` is delayed by `late` periods."""
     (a, command), whole = loop.closed_at_sensors(np), int(late)
     (m, n), pushes = command.shape, np.zeros((whole + 2, *command.T.shape))
     pushes[0] = loop.new[0] * (np.arange(m) != axis)

@@ -77,7 +77,10 @@ def test_covariance_predicts_the_error_of_simulated_trials(case, trials, start):
 
 
 def simulated_chain(**changes):
-    """Return the parts of a chain of order 2 at rest on its target, and the RMS window error of 2 000 trials."""
+    """Return the parts of a chain of order 2 at rest on its target, and the RMS window error of 2 000 trials.
+
+    changes: tables of the scenario; `loop` is required, with at most 40 periods.
+    """
     tables = {
         "plant": {"kind": "chain", "x0": [0.0, 0.0]},
         "loop": {"mode": "sampled", "clock": "flight", **changes.pop("loop")},

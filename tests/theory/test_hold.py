@@ -24,9 +24,10 @@ GRID = (4000, 800)
 
 
 def simulated(law, c, k):
-    """Return a run without disturbance or switching.
+    """Return the parts of a run without disturbance or switching.
 
-    The hand-over is 2 s before t_f = 10 s, so that a large error remains.
+    law: order of a chain, or the kinematics of a spacecraft. c: slope of the surface. k: reaching rate. The hand-over
+    is 2 s before t_f = 10 s, so that a large error remains.
     """
     t_end = 12.0
     grid = clock.Graded(vector(t_end), vector(1.0), vector(1.5 * 10.0 / GRID[0]), jnp.zeros(0), *GRID)
@@ -41,7 +42,7 @@ def simulated(law, c, k):
 
 @jax.jit
 def exact(run, t):
-    """Return error, s and acceleration of the closed forms at times t in the hold phase."""
+    """Return error, s and acceleration, (times, m) each, of the closed forms at times t in the hold phase."""
     law = run.controller
 
     def component(x0):

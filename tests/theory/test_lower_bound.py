@@ -21,7 +21,7 @@ PERIOD = 0.125  # a power of two, so that t_f and the ends of the window are exa
 
 
 def still(made):
-    """Return a history at rest with the duration of the scenario.
+    """Return a history at rest with the duration of the scenario; made: its parts.
 
     Only the fields that `lower_bound` reads have values.
     """
@@ -38,7 +38,7 @@ def still(made):
 
 
 def simulated_at(made, **changes):
-    """Return the parts with the flight clock and changed devices."""
+    """Return the parts with the flight clock and changed devices; changes: fields of the parts."""
     return dataclasses.replace(made, clock=clock.flight_clock(PERIOD, float(made.t_end)), **changes)
 
 
@@ -48,7 +48,7 @@ def delayed(periods):
 
 
 def by_least_squares(move, push, rows, noise, prior, output, delay):
-    """Variances (periods, outputs) by least squares over all samples at once.
+    """Return variances (periods, outputs) by least squares over all samples at once.
 
     The model is z_{k+1} = move z_k + push v_k with standard normal v_k.
 

@@ -48,7 +48,7 @@ def chain(**changes):
 
 
 def opened(parts, hold=True):
-    """Return the open loop of the last full period in the hold phase, or in the approach phase."""
+    """Return the open loop of the last full period in the hold phase, or in the approach phase if `hold` is false."""
     run = linear.simulate_nominal_jit(parts)
     for side in (True, False):
         periods = linear.full_periods(parts, run, hold=side)
@@ -152,9 +152,10 @@ def test_margin_derivatives_equal_finite_differences():
 
 
 def simulated(parts, run, index, gain, late):
-    """Growth rate per period of a small deviation from the nominal run, with changed gains and delays.
+    """Return the growth rate per period of a small deviation from the nominal run, with changed gains and delays.
 
-    The simulation repeats one period of the nominal run, so that the gains are frozen.
+    The rate is a logarithm. index: of the period that the simulation repeats, so that the gains are frozen. gain, late:
+    factor and delay [periods] of each command.
     """
     sizes = np.asarray(_simulated(linear.quiet(parts), run, *map(jnp.asarray, (index, gain, late))))
     beyond = np.flatnonzero((sizes > np.log(1e-3)) | (sizes < np.log(1e-8)))  # nonlinear, or rounding
@@ -165,7 +166,10 @@ def simulated(parts, run, index, gain, late):
 
 @jax.jit
 def _simulated(parts, run, index, gain, late):
-    """Return the logarithm of a small deviation after each of 6000 repetitions of one period."""
+    """Return the logarithm of a small deviation after each of 6000 repetitions of one period, (6000,).
+
+    The arguments are those of `simulated`.
+    """
     period, carry_0, _, base = jax.tree.map(lambda v: v[index], run)
     k2 = parts.observer.error_bound()
     delay = parts.actuators.delay
@@ -328,7 +332,7 @@ AT_NYQUIST = (1065, 1080, 1111, 1122)
 
 @jax.jit
 def closed_at_both(loop):
-    """Transition matrices after closing the loop that was opened at the sensors, and at the input."""
+    """Return two transition matrices: after closing the loop that was opened at the sensors, and at the input."""
     return linear.open_at_sensors(loop).closed(), linear.open_at_input(loop).closed()
 
 

@@ -18,10 +18,10 @@ from tests.theory.test_lower_bound import AT_REST, PERIOD, delayed, rms_in_windo
 
 
 def history(moments, walks):
-    """Return a function of (period, time in it) with the derivatives of the state by all unknowns, (12, 12 + 6 N).
+    """Return a function of (period, time in it [s]) with the derivatives of the state by all unknowns, (12, 12 + 6 N).
 
-    The state is angle, rate, bias and torque, 3 components each. The unknowns are the state at t = 0, and in each
-    period the drift of the bias and the step of the torque.
+    moments: of inertia (3,). walks: a sequence of length N. The state is angle, rate, bias and torque, 3 components
+    each. The unknowns are the state at t = 0, and in each period the drift of the bias and the step of the torque.
     """
     a = np.zeros((12, 12))
     a[0:3, 3:6], a[3:6, 9:12] = np.eye(3), np.diag(1.0 / moments)

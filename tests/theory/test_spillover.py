@@ -44,7 +44,7 @@ def parts_of(**changes):
 
 
 def in_theory(**changes):
-    """Return parts with noise, which does not affect loops, and padded time grids, to share compiled programs."""
+    """Return parts with noise and padded time grids, to share compiled programs; noise does not affect loops."""
     parts = parts_of(**NOISY, **changes)
     return replace(parts, clock=roomy(parts.clock), substeps=25)
 
@@ -88,7 +88,7 @@ def test_covariance_of_noise_and_random_walk_equals_simulated_trials():
 
 
 def slowest_pair(y):
-    """Return the modulus r of the dominant pole pair of an oscillation y.
+    """Return the modulus r of the dominant pole pair of an oscillation y (samples,).
 
     Its samples obey y(k + 2) = 2 r cos(a) y(k + 1) - r^2 y(k).
     """

@@ -99,7 +99,7 @@ def test_distance_to_the_singularity_along_the_exact_motion_equals_the_simulated
 
 
 def random_body(rng):
-    """Return a random inertia of point masses, which is physically possible."""
+    """Return a random inertia (3, 3) of point masses, which is physically possible."""
     points = rng.normal(size=(6, 3)) * rng.uniform(0.3, 2.0, size=3)
     return np.trace(points.T @ points) * np.eye(3) - points.T @ points
 
@@ -128,7 +128,10 @@ def grid(t_f):
 
 
 def stays_inside_the_corrected_bounds(case):
-    """Check (55) with sqrt(3) c and l_m of a full inertia; (32), (20), (23) with the residual of the smooth sign."""
+    """Check (55) with sqrt(3) c and l_m of a full inertia; (32), (20), (23) with the residual of the smooth sign.
+
+    case: random values of gains, initial attitude and disturbance by name.
+    """
     rng = np.random.default_rng(case["seed"])
     body, t_f = random_body(rng), case["t_f"]
     axis = rng.normal(size=3)
@@ -170,7 +173,7 @@ test_many_spacecraft_stay_inside = pytest.mark.long(drawn(stays_inside_the_corre
 
 
 def slew(seed, eta, t_f):
-    """Return an undisturbed slew from rest of a random body, from a random attitude 5 to 150 degrees away."""
+    """Return the parts of an undisturbed slew from rest of a random body, over an angle of 5 to 150 degrees."""
     rng = np.random.default_rng(seed)
     angle, axis = np.deg2rad(rng.uniform(5.0, 150.0)), rng.normal(size=3)
     q = np.append(np.sin(angle / 2) * axis / np.linalg.norm(axis), np.cos(angle / 2))
