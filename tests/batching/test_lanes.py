@@ -472,7 +472,10 @@ def mapped(group):
 
 @pytest.mark.parametrize("name", CASES)
 def test_lanes_vmap_equals_jax_vmap(name):
-    """Functions with rules for all primitives cause no warning, which pytest would raise as an error."""
+    """The results agree outside and inside a loop.
+
+    Only functions with a primitive without a rule cause a warning, which pytest would raise as an error otherwise.
+    """
     expected, outside_loops, inside_loop = mapped(name.split(":")[0])[name]
     agree(outside_loops, expected)
     agree(inside_loop, expected)

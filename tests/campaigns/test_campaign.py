@@ -69,7 +69,11 @@ def test_drawn_inputs_equal_the_inputs_of_the_simulated_rows(simulated):
 
 
 def test_failed_trials_do_not_affect_the_others():
-    """Initial angles are near 180 deg, so that a third of the trials reaches the law's singularity or diverges."""
+    """Rows of failed trials have a time and a reason; the other rows are those of a run without failed trials.
+
+    Metrics that a failed trial does not have are empty. Initial angles are near 180 deg, so that a third of the trials
+    reaches the law's singularity or diverges.
+    """
     far = {"kind": "axis_angle", "min_deg": 170.0, "max_deg": 180.0}
     made = of_scenario({**untuned(SHORT), "dispersion": {"attitude": far}}, 0)
     frame = made.simulate(range(600))

@@ -49,8 +49,11 @@ def _dask(monkeypatch):
     monkeypatch.setattr(distributed, "as_completed", lambda futures, **_: iter(futures))
 
 
-def simulated_by(monkeypatch, tmp_path, receipt):
-    """Return a fake campaign whose cluster workers answer with `receipt(first trial, number of trials)`."""
+def campaign_with_workers(monkeypatch, tmp_path, receipt):
+    """Make cluster workers answer with `receipt(first trial, number of trials)`; return a fake campaign.
+
+    The fake campaign is an argument of the function that `cluster.connect` returns.
+    """
     monkeypatch.setattr(cluster, "_simulate_part", lambda recipe, first, count: receipt(first, count))
     return SimpleNamespace(recipe=lambda: (None, "x"), rows=Rows(tmp_path, b"k"))
 
@@ -78,8 +81,8 @@ def test_a_local_cluster_listens_on_the_loopback_only(monkeypatch):
 def test_results_of_cluster_workers_become_parts_of_the_campaign(monkeypatch, tmp_path):
     here = store.packages()
     (tmp_path / "p.parquet").write_bytes(b"")
-    folder = simulated_by(monkeypatch, tmp_path, lambda first, count: (first, count, "p.parquet", 7, here))
-    found = list(cluster.connect("tcp://a:1", {})(folder, [(0, 10), (10, 5)]))
+    campaign = campaign_with_workers(monkeypatch, tmp_path, lambda first, count: (first, count, "p.parquet", 7, here))
+    found = list(cluster.connect("tcp://a:1", {})(campaign, [(0, 10), (10, 5)]))
     assert [(part.first, part.count, failed) for part, failed in found] == [(0, 10, 7), (10, 5, 7)]
 
 
@@ -93,15 +96,16 @@ def test_results_of_cluster_workers_become_parts_of_the_campaign(monkeypatch, tm
     ],
 )
 def test_cluster_workers_that_failed_or_have_other_versions_are_refused(monkeypatch, tmp_path, change, said):
+    """A worker that wrote into a folder that is not shared is refused too. The other futures are cancelled."""
     def receipt(first, count):
         if isinstance(change, Exception):
             raise change
         versions = store.packages() | (change or {})
         return first, count, "gone.parquet", 0, versions
 
-    folder = simulated_by(monkeypatch, tmp_path, receipt)
+    campaign = campaign_with_workers(monkeypatch, tmp_path, receipt)
     with pytest.raises(RefusedError, match=said):
-        list(cluster.connect("tcp://a:1", {})(folder, [(0, 10)]))
+        list(cluster.connect("tcp://a:1", {})(campaign, [(0, 10)]))
     assert len(FakeClient.made.cancelled) == 1  # the other futures are cancelled
 
 

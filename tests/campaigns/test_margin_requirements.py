@@ -288,6 +288,10 @@ def test_a_trial_that_failed_meets_no_required_margin(drawn):
 
 
 def test_trials_that_fail_after_the_judged_trials_change_no_verdict_on_the_nominal_loop():
+    """Only the first TRIALS trials count, also if no dispersion changes the loop.
+
+    A failed trial among them fails every margin.
+    """
     ready = scenario.study(scenario.from_tables({**DRAWN["chain"], "dispersion": {}}))
     finished = np.arange(2 * TRIALS) != TRIALS
     assert [verdict.reason for verdict in margin_verdicts.judge_trials(ready, 3, None, finished)] == ["", ""]

@@ -89,6 +89,10 @@ def of_run_table(made, table):
 # the spacecraft is a long test, because a later test checks that its run table has the exact inputs
 @pytest.mark.parametrize("which", ["of_a_chain", pytest.param("everything", marks=pytest.mark.long)])
 def test_campaign_of_a_written_run_table_has_identical_rows(which, request, tmp_path):
+    """Rows of a campaign, in any order, are a run table too.
+
+    Their results are ignored, and each row keeps the noise of its trial.
+    """
     made, run_table = request.getfixturevalue(which)
     frame = made.simulate(range(TRIALS))
     run_table.write_csv(tmp_path / "run_table.csv")
@@ -414,8 +418,11 @@ MISFIT = [
 
 
 @pytest.fixture(scope="module")
-def misfit():
-    """Return the parts of a spacecraft with wheels, an attitude filter and a flexible mode."""
+def hardware_parts():
+    """Return the parts of a spacecraft with wheels, an attitude filter and a flexible mode.
+
+    The tests check run tables against these parts.
+    """
     return ready(HARDWARE).parts
 
 
@@ -425,16 +432,16 @@ def table_of(columns, rows):
 
 
 @pytest.mark.parametrize(("columns", "rows", "said"), MISFIT, ids=[row[2][-60:] for row in MISFIT])
-def test_impossible_hardware_errors_of_a_run_table_are_refused_with_row_and_column(misfit, columns, rows, said):
+def test_impossible_hardware_errors_of_a_run_table_are_refused_with_row_and_column(hardware_parts, columns, rows, said):
     with refuses(RefusedError, said):
-        run_tables.check_table(table_of(columns, rows), misfit)
+        run_tables.check_table(table_of(columns, rows), hardware_parts)
 
 
-def test_limiting_cases_of_hardware_errors_in_a_run_table_are_accepted(misfit):
+def test_limiting_cases_of_hardware_errors_in_a_run_table_are_accepted(hardware_parts):
     """Outages of zero length, wheel 0 (no failure), the last wheel, and a coupling that needs the row's inertia."""
     heavy = (20.0, 0.0, 0.0, 20.0, 0.0, 20.0)
     rows = [(-1.0, -1.0, 2.0, 0.0, 4.0, 0.0, 0.0, *heavy), (3.0, 3.0, 2.0, 4.0, 0.0, 0.0, 4.4, *heavy)]
-    run_table = run_tables.check_table(table_of([*OUTAGE, *FAILURE, *COUPLING, *J], rows), misfit)
+    run_table = run_tables.check_table(table_of([*OUTAGE, *FAILURE, *COUPLING, *J], rows), hardware_parts)
     assert [list(values[1]) for values in run_table.given.values()] == [[3, 3], [2, 4], [0, 0, 4.4], list(heavy)]
 
 

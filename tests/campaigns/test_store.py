@@ -203,7 +203,8 @@ def test_names_that_are_not_unicode_are_written_with_escapes(tmp_path):
     assert (tmp_path / "a.txt").read_text(encoding="utf-8") == "gr\\udcf6\\udcdfe \u03b1"
 
 
-def test_run_that_cannot_begin_on_a_full_disk_leaves_no_files(tmp_path, monkeypatch):
+def test_run_that_cannot_begin_on_a_full_disk_keeps_earlier_results_and_leaves_no_new_files(tmp_path, monkeypatch):
+    """The run was started with `fresh`, which would replace the earlier results."""
     tables = {"controller": {"eta": 3.0}}
     finished(tmp_path / "old", tables)
     before = tree(tmp_path)

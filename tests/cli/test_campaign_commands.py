@@ -108,6 +108,7 @@ def test_failed_trials_without_metrics_cause_no_warning_of_equal_metrics():
 
 
 def test_more_trials_extend_an_existing_campaign(command, simulated, tmp_path):
+    """Complete files of rows are not written again. Fewer trials than exist are refused."""
     before = rows_of(simulated)
     files = {path: path.stat().st_mtime_ns for path in (simulated / "trials").iterdir()}
     assert command("montecarlo", "s.toml", "--trials", 420, "--seed", 3, "--no-figures", "--quiet")[0] == 0

@@ -264,6 +264,7 @@ def history_of(folder):
 
 
 def test_simulate_without_a_file_runs_case_one_of_the_paper(command, tmp_path):
+    """The first row is that of theory.md 3.3, and the summary equals the metrics of the history."""
     assert command("simulate", "--quiet", "--no-figures") == (0, "", "")
     folder = tmp_path / "out" / "simulate-default"
     assert set(tree(folder)) == {"trajectory.csv", "summary.json", "scenario.toml", "versions.json"}

@@ -99,6 +99,7 @@ def test_identify_names_a_constant_torque_that_the_log_does_not_tell_from_a_slow
 
 
 def test_a_designed_manoeuvre_has_a_profile_within_the_limits(command, logged):
+    """The manoeuvre has a smaller expected standard deviation than plain slews."""
     options = "--design", "--duration", "0.1 min", "--rate", "500 mrad/s"
     status, out, err = command("identify", "s.toml", *options, "--out", "plan")
     assert status == 0, err

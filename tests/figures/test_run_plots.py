@@ -68,7 +68,7 @@ def test_the_sliding_variable_has_its_unit_in_both_phases():
 
 
 def test_required_limits_are_drawn_in_the_intervals_in_which_they_apply():
-    """Earlier, a limit of the error about one axis was drawn beside the error about all axes."""
+    """A limit of the error about one axis is not drawn. Earlier, it was drawn beside the error about all axes."""
     required = {"peak_torque": 3.0, "terminal_angle": 0.01, "window_error": 1e-3, "hold_angle": 0.1, "ape_x": 1e-4}
     tables = untuned(SHORT) | {"requirements": required, "pointing": {"boresight": [0, 0, 1], "after": 0.5}}
     figures = ptsmc_jax.simulate(from_tables(tables)).plot("error", "torque")

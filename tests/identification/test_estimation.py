@@ -466,7 +466,10 @@ def test_the_variance_of_the_data_but_not_of_prior_knowledge_is_inflated():
 
 
 def test_prior_knowledge_determines_what_the_data_do_not():
-    """An earlier version denied this in every other case, because of rounding errors."""
+    """`determines_all` judges the Fisher information of the data, without and with the prior.
+
+    An earlier version denied that the prior determines all for half of the matrices, because of rounding errors.
+    """
     for seed in range(20):
         derivatives = 1e3 * np.random.default_rng(seed).standard_normal((500, 4))
         derivatives[:, 3] = -np.sum(derivatives[:, :3], axis=1)  # equal changes of all coordinates have no effect

@@ -98,6 +98,7 @@ def test_sliding_variable_obeys_its_reaching_law(n, hold):
 
 @pytest.mark.parametrize("n", [2, 3, 4, 5])
 def test_hurwitz_check_agrees_with_eigenvalues(n):
+    """The polynomial of a chain of order n has the degree n - 1."""
     rng = np.random.default_rng(n)
     for _ in range(50):
         a = rng.normal(size=n - 1) + 1.0

@@ -258,11 +258,11 @@ def test_random_keys_raise_an_error_as_constants_and_in_memories():
         struct_fields({"law": jax.ShapeDtypeStruct((), key.dtype)}, {})
 
 
-@pytest.mark.parametrize("known", [jnp.asarray([1.0 + 2.0j, 2.0, 3.0]), jnp.asarray([1, 2, 3], jnp.uint64)])
-def test_constants_of_unsupported_types_raise_an_error(known):
+@pytest.mark.parametrize("constant", [jnp.asarray([1.0 + 2.0j, 2.0, 3.0]), jnp.asarray([1, 2, 3], jnp.uint64)])
+def test_constants_of_unsupported_types_raise_an_error(constant):
     """The error is one sentence instead of a traceback."""
-    with pytest.raises(NoRuleError, match=rf"^a constant has the type {known.dtype}, but must have"):
-        body(lambda x: (x * known).real, X)
+    with pytest.raises(NoRuleError, match=rf"^a constant has the type {constant.dtype}, but must have"):
+        body(lambda x: (x * constant).real, X)
 
 
 @needs_compiler

@@ -129,7 +129,7 @@ def test_the_verdict_is_the_first_content_of_the_report_page(simulated, status, 
     ("met", True, "good"), ("met", False, "calm"), ("ok", False, "calm"),
     ("diverged", False, "bad"), ("not met", False, "bad"), ("interrupted", True, "bad"),
 ])  # fmt: skip
-def test_headline_of_a_failure_has_its_colour_with_and_without_requirements(status, asked, mood):
+def test_headline_has_the_colour_of_its_status_with_and_without_requirements(status, asked, mood):
     """If nothing failed, the colour is neutral without requirements, and good if all requirements are met."""
     verdicts = [examples.entry(Requirement("peak_torque", 0.5).verdict(np.zeros(2), np.ones(2, bool)))]
     assert report.headline(status, verdicts if asked else [])[1] == mood

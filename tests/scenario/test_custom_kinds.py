@@ -463,6 +463,7 @@ def test_errors_in_custom_code_during_a_run_are_one_sentence(command, here, monk
 
 
 def test_an_absent_custom_file_is_refused_and_not_reported_as_run(command, here):
+    """The error is the only line, so no line reports that the command runs the file."""
     (here / "s.toml").write_text(SHORT_CUSTOM.replace("mine.py", "my/laws.py"))
     code, _, error = command("simulate", "s.toml")
     assert code == 2

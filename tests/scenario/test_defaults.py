@@ -407,7 +407,7 @@ def test_a_custom_disturbance_that_disperses_an_unknown_field_is_refused(drawn, 
 
 
 @pytest.mark.parametrize(
-    ("hardware", "said"),
+    ("hardware", "warned"),
     [
         ({"attitude_noise": 2e-5}, True),
         ({"attitude_noise": 2e-5, "torque_limit": 0.5}, True),
@@ -418,10 +418,11 @@ def test_a_custom_disturbance_that_disperses_an_unknown_field_is_refused(drawn, 
         ({"torque_limit": 0.5}, False),
     ],
 )
-def test_a_noisy_star_tracker_with_a_perfect_gyro_causes_a_warning(hardware, said):
+def test_a_noisy_star_tracker_with_a_perfect_gyro_causes_a_warning(hardware, warned):
+    """There is no warning if the scenario states that the gyro has no noise."""
     found = plausibility.warnings(scenario.from_tables({"loop": {"mode": "sampled"}, "hardware": hardware}))
     assert [one for one in found if "hardware.attitude_noise is 2e-05 rad" in one and "true rate" in one] == found
-    assert bool(found) == said
+    assert bool(found) == warned
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ def test_defaults_of_a_chain_scale_with_t_f(order):
 
 
 @pytest.mark.parametrize(
-    ("changes", "published"),
+    ("changes", "is_published"),
     [
         ({}, True),
         ({"controller": {"t_f": 40.0}}, True),
@@ -42,11 +42,12 @@ def test_defaults_of_a_chain_scale_with_t_f(order):
     ],
     ids=str,
 )
-def test_default_gains_of_published_cases_are_the_published_gains(changes, published):
+def test_default_gains_are_the_published_gains_in_published_cases_only(changes, is_published):
+    """Published cases have the published inertia and a t_f of 30 to 40 s, or are chains with a t_f of 5 s."""
     law = scenario.from_tables({**SAMPLED, **changes}).controller
-    assert mission.is_published_case(scenario.from_tables(changes)) == published
+    assert mission.is_published_case(scenario.from_tables(changes)) == is_published
     found = (law.eta, law.delta, law.k1, law.surface_rate, law.sign_width)
-    assert (found == (3.0, 0.05, 1.0, 1.0, 1e-3)) == published
+    assert (found == (3.0, 0.05, 1.0, 1.0, 1e-3)) == is_published
 
 
 @pytest.mark.parametrize("hardware", [{}, {"delay": 2}, {"torque_lag": 0.5}], ids=str)

@@ -111,6 +111,10 @@ def test_differential_evolution_ends_early_without_progress():
 
 @pytest.mark.parametrize("size", [evolution.NEAR_BEST, evolution.WHOLE_BOX])
 def test_first_generation_is_around_the_starting_point_or_in_the_whole_box(size):
+    """The starting point itself is the first point.
+
+    size: number of points and their standard deviation (inf: whole box).
+    """
     evaluator = Quadratic(np.eye(2))
     refined(evaluator, [0.1, -0.2], size=size)
     first = evaluator.seen[1]  # after the starting point itself

@@ -361,8 +361,8 @@ def test_a_trial_without_a_value_of_the_required_metric_is_the_hardest(plant):
     assert (found.c == objective.FAILED - 1.0).any()
 
 
-def test_failing_trials_have_no_worst_case():
-    """The squares of the initial states overflow."""
+def test_the_hardest_trial_is_unbounded_if_it_is_singular_or_diverges():
+    """A hardest trial that has not converged is not unbounded. Here the squares of the initial states overflow."""
     problem, wanted = swinging(1.0, [1e160, 0.0], 0.0)
     found = worst.find_hardest(problem, wanted, np.array([ETA, 1.0]))
     assert found.unbounded

@@ -111,6 +111,7 @@ def test_a_three_sigma_requirement_needs_852_trials():
     (0, 0.9999, 0.9, False),
 ])  # fmt: skip
 def test_a_requirement_on_a_fraction_of_the_trials_allows_some_violations(beyond, quantile, confidence, met):
+    """Its margin is the factor on the limit at which the requirement is just met."""
     values = np.linspace(0.1, LIMIT, 1000)
     values[:beyond] = BEYOND + np.arange(beyond) * 0.01
     told = Requirement("peak_torque", LIMIT, None, quantile, confidence).verdict(values, np.ones(1000, bool))
@@ -156,6 +157,7 @@ def test_rounding_does_not_change_the_required_number_of_trials(trials, quantile
 
 
 def test_a_verdict_on_a_fraction_of_the_trials_is_printed_in_words():
+    """NOT met: too many trials violate the limit. NOT shown: there are too few trials for the confidence."""
     values = np.linspace(0.1, 0.4, 1000)
     share = Requirement("peak_torque", LIMIT, None, 0.99, 0.9)
     said = "peak_torque at most 0.5 N m in 99 % of trials with 90 % confidence: worst"

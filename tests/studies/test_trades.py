@@ -174,8 +174,12 @@ def test_margins_of_a_front_are_those_of_the_loops_if_a_trial_fails():
     assert min(costs[name] for name in MARGINS) > 0.0
 
 
-def test_faster_slew_needs_more_torque_and_is_less_accurate(command, tmp_path, monkeypatch):
-    """The peak torque of a slew is proportional to 1 / t_f^2, and the peak rate to 1 / t_f."""
+def test_pareto_against_t_f_finds_gains_for_each_time_and_faster_slews_need_more_torque(command, tmp_path, monkeypatch):
+    """The gains of each time are more accurate at this time than the gains of the other time.
+
+    The peak torque of a slew is proportional to 1 / t_f^2, and the peak rate to 1 / t_f. Files and report agree with
+    the search, and times that were searched before are read from the earlier run.
+    """
     small_search(monkeypatch, 60)
     # times up to the scenario's t_f, so that the compiled programs of other searches can be used
     (tmp_path / "c.toml").write_text(SHORT_CHAIN.replace("[2e-5, 1e-5]", "[2e-3, 1e-3]"))

@@ -225,8 +225,8 @@ def test_lower_bound_of_a_spacecraft_at_rest_equals_least_squares(kind):
     np.testing.assert_allclose(found.window_error, rms_in_window(made, squares), rtol=1e-8)
 
 
-def test_lower_bounds_of_several_runs_equal_separate_calls():
-    """The runs differ in noise, delay and duration, and one has no uncertainty."""
+def test_bounds_on_the_error_of_several_runs_equal_separate_calls():
+    """The bound of a run without uncertainty is 0. The runs differ in noise, delay and duration."""
 
     def chain(t_f=2.0, noise: Any = (1e-3, 5e-2), delay=0):
         made = chain_parts([0.5, -0.2], t_f=t_f, period=PERIOD, noise=noise)

@@ -623,6 +623,10 @@ def test_hold_loop_does_not_depend_on_delta(delta):
     (40.0, 12.0, 0.1, (12.0, 12.0)),  # delta exceeds a quarter of t_f
 ])  # fmt: skip
 def test_margins_are_judged_between_the_hand_over_and_a_quarter_of_t_f_to_go(t_f, delta, period, ends):
+    """The times to go are from delta (the hand-over), but at least ten periods, to t_f / 4, but at least delta.
+
+    ends: first and last judged time to go [s].
+    """
     tables = {"plant": {"kind": "chain"}, "controller": {"t_f": t_f, "delta": delta}}
     made = scenario.from_tables({**tables, "loop": {"mode": "sampled", "period": period}})
     spread = np.geomspace(ends[0], ends[1], 4)
