@@ -97,6 +97,7 @@ def test_results_of_cluster_workers_become_parts_of_the_campaign(monkeypatch, tm
 )
 def test_cluster_workers_that_failed_or_have_other_versions_are_refused(monkeypatch, tmp_path, change, said):
     """A worker that wrote into a folder that is not shared is refused too. The other futures are cancelled."""
+
     def receipt(first, count):
         if isinstance(change, Exception):
             raise change

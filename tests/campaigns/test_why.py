@@ -28,7 +28,7 @@ class Rows:
     units = campaign_folder.Folder.units
 
     def intact_parts(self):
-        """Return a list with the only file of rows, which this object stands for."""
+        """Return a list with the only file of rows, which is this object."""
         return [self]
 
 

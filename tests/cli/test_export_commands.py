@@ -16,7 +16,7 @@ SCENARIO, CONTINUOUS = SHORT_CHAIN, SHORT.replace('"sampled"', '"continuous"').s
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
-    """Return the path of the folder to which the controller of s.toml is exported."""
+    """Return the path of the folder with the exported controller of s.toml."""
     place = tmp_path_factory.mktemp("exported")
     (place / "s.toml").write_text(SHORT_CHAIN)
     return folder.export(place / "s.toml", place / "c", trials=1)

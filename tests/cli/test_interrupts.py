@@ -93,6 +93,7 @@ def recorded(summary, command="tune"):
 @pytest.mark.parametrize(("force", "same"), [(False, "the same command"), (True, "the same command without --force")])
 def test_search_interrupted_while_writing_reports_how_to_resume_and_leaves_no_results(tmp_path, shown, force, same):
     """Only journal, scenario and versions are left: no summary, and no report is printed."""
+
     def write_then_interrupt(folder, outcome):
         (folder / "summary.json").write_text(outcome.status)
         raise KeyboardInterrupt

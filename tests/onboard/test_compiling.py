@@ -18,7 +18,7 @@ from tests.onboard.flights import FLIGHTS
 
 @pytest.fixture(scope="module")
 def chain(tmp_path_factory):
-    """Return the folder to which the controller of a chain is exported."""
+    """Return the folder with the exported controller of a chain."""
     place = tmp_path_factory.mktemp("exported") / "controller"
     program(FLIGHTS["chain"], place)
     return place

@@ -86,7 +86,7 @@ def true_states(made, rows):
 
 @pytest.fixture(scope="module")
 def rich():
-    """Return the `folder.Controller`, from which both FMUs are exported.
+    """Return the `folder.Controller`; the FMUs of controller and plant are exported from it.
 
     Its scenario has wheels, delay, filter, noise, dispersions and a wheel failure.
     """

@@ -368,7 +368,7 @@ def fractions() -> Iterable[str]:
 
 
 def settling(without: int) -> Iterable[Table]:
-    """Return the tables of quantiles if `without` of 60 trials never settled, of which one failed."""
+    """Return the tables of quantiles if `without` of 60 trials never settled. One of these trials failed."""
     times = {"without_value": without, "max": 57.2, "0.5": AT, "0.9973": AT}
     counts = {"ok": 58, "not_converged": 1, "diverged": 1}
     return campaign_report.quantile_tables(examples.campaign(counts=counts, quantiles={"settling_time": times}))

@@ -47,7 +47,8 @@ def test_the_deadbeat_gain_leaves_the_documented_fraction_of_the_slowest_error(i
 def growth(c, k, late, keep=0.6, period=1.0):
     """Return the logarithm of the growth per period of one axis under the sampled law in the hold phase.
 
-    c: slope of the surface. k: reaching rate. late: delay in whole periods. keep: pole of the digital observer.
+    c: coefficient of the surface s = v' + c v. k: reaching rate. late: delay in whole periods. keep: pole of the
+    digital observer.
     """
     state, estimate = np.array([1.0, 0.3]), 0.0
     commands, sizes = [0.0] * late, []

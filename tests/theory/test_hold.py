@@ -26,8 +26,8 @@ GRID = (4000, 800)
 def simulated(law, c, k):
     """Return the parts of a run without disturbance or switching.
 
-    law: order of a chain, or the kinematics of a spacecraft. c: slope of the surface. k: reaching rate. The hand-over
-    is 2 s before t_f = 10 s, so that a large error remains.
+    law: order of a chain, or the kinematics of a spacecraft. c: coefficient of the surface s = v' + c v. k: reaching
+    rate. The hand-over is 2 s before t_f = 10 s, so that a large error remains.
     """
     t_end = 12.0
     grid = clock.Graded(vector(t_end), vector(1.0), vector(1.5 * 10.0 / GRID[0]), jnp.zeros(0), *GRID)
