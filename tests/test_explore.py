@@ -31,6 +31,7 @@ def flight():
 
 
 def test_simulate_returns_metrics_verdicts_and_history_of_a_trial(flight):
+    """They equal those of `runs.simulate`."""
     run = runs.simulate(scenario.study(flight.scenario), 3, 7)
     assert list(flight.metrics) == list(run.metrics)
     np.testing.assert_array_equal(list(flight.metrics.values()), list(run.metrics.values()))
@@ -114,6 +115,7 @@ def test_simulate_refuses_a_nominal_initial_attitude_at_the_singularity_of_the_l
 
 
 def test_html_tables_of_a_run_show_units_and_escape_their_texts(flight):
+    """The texts for a terminal show status and units too."""
     shown = flight._repr_html_()
     for name, entry in flight.run.catalogue.items():
         assert f"<td>{name}</td>" in shown
@@ -222,6 +224,7 @@ def test_an_incomplete_run_shows_its_reason_and_dashes_for_missing_metrics():
 
 
 def test_an_animation_draws_body_and_reference_at_even_times(monkeypatch):
+    """The edges of the body and the axes of body and reference are compared with the attitudes of the history."""
     drawn = []
 
     class Watched:

@@ -38,6 +38,7 @@ def test_a_notebook_runs_without_errors_and_warnings(source):
 
 @every_notebook
 def test_a_stored_notebook_matches_its_source_and_has_portable_outputs(source):
+    """The outputs are texts, tables and PNG images, without scripts, errors or local paths."""
     kept, edited = nbformat.read(source.with_suffix(".ipynb"), 4), jupytext.read(source)
     assert [(cell.cell_type, cell.source) for cell in kept.cells] == [
         (cell.cell_type, cell.source) for cell in edited.cells

@@ -70,7 +70,10 @@ def test_a_stored_program_is_traced_once_and_read_by_the_next_process(folder):
 
 @pytest.mark.parametrize("stored", [False, True])
 def test_all_programs_but_batches_run_on_the_cpu_if_jax_has_a_gpu(tmp_path, monkeypatch, stored):
-    """A second CPU device represents the GPU."""
+    """A second CPU device represents the GPU.
+
+    A program that is a part of a program of the caller runs on the device of the caller.
+    """
     if stored:
         monkeypatch.setattr(configure, "programs", tmp_path)
     cpu, gpu = jax.local_devices()[:2]

@@ -240,7 +240,10 @@ def abstract_gpu():
 
 
 def test_kernel_supports_nested_loops_branches_and_shared_values(kernels):
-    """Short loops are unrolled and may stack results. Long loops iterate over tables. Branches are by trial or step."""
+    """Short loops are unrolled and may stack results. Long loops iterate over tables. Branches are by trial or step.
+
+    A loop over a table that differs by trial does not run as a kernel.
+    """
     table = jnp.linspace(0.0, 1.0, 100)
 
     def function(trial, weight):

@@ -33,6 +33,7 @@ def simulated():
 
 
 def test_row_has_all_results_and_inputs_of_its_trial(simulated):
+    """A single simulation of a trial has the results and inputs of its row. The nominal run has no random inputs."""
     made, frame = simulated
     assert frame.columns[:4] == ["trial", "status", "reason", "bad_time"]
     assert frame.columns[4 : 4 + len(made.ready.catalogue)] == list(made.ready.catalogue)

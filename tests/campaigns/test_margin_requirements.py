@@ -228,7 +228,10 @@ def drawn(request):
 
 
 def test_margin_constraints_agree_with_verdicts_and_finite_differences(drawn):
-    """Compare gradients with central differences of order 4 along a direction that changes all gains."""
+    """Compare gradients with central differences of order 4 along a direction that changes all gains.
+
+    The verdicts use the loops of the same trials, in any order of the rows. The constraints are ratios to the limits.
+    """
     posed = drawn
     asked, bounds, normalised = (
         posed.problem.margins,
@@ -319,6 +322,10 @@ def test_margin_gradients_with_dispersed_inertia_compile_if_delta_is_free():
 
 
 def test_evaluator_appends_constraints_on_the_worst_margins_of_all_trials(drawn, monkeypatch):
+    """They are appended to the constraints of the metrics, and padded to equal length.
+
+    With other gains, other trials are the hardest and become the constraints.
+    """
     posed = drawn
     assert posed.problem.rows == ("peak_torque", "gain_margin", "peak_sensitivity")
     normalised = posed.evaluate.bounds.normalise(posed.scenario_gains)[None]

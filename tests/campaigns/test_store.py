@@ -32,7 +32,10 @@ def test_writing_into_an_existing_folder_replaces_only_what_is_written(tmp_path)
 
 
 def test_files_of_an_earlier_result_are_removed_and_the_summary_is_written_last(tmp_path, monkeypatch):
-    """A page shows all figures of a folder, so old ones must go. Without a summary, a result is not complete."""
+    """A page shows all figures of a folder, so old ones must go. Without a summary, a result is not complete.
+
+    Files of the user are kept, also if they have the name of a result file.
+    """
     moved, replace = [], os.replace
     monkeypatch.setattr(os, "replace", lambda a, b: (moved.append(b.name), replace(a, b)))
 
@@ -344,7 +347,10 @@ def test_versions_describe_command_code_and_platform(monkeypatch):
 
 
 def test_unfinished_run_resumes_only_with_the_same_command(tmp_path):
-    """Seed, scenario and versions must be the same, too. The command line may differ."""
+    """Seed, scenario and versions must be the same, too. The command line may differ.
+
+    A fresh run replaces journal and summary. A finished run is not resumed.
+    """
     tables, folder = {"controller": {"eta": 3.0}}, tmp_path / "new"
     assert not store.has_unfinished_run(folder, tables, TOLD)
     journal = store.begin_run(folder, tables, TOLD, fresh=True)

@@ -33,6 +33,11 @@ class Rows:
 
 
 def test_inputs_of_the_worst_trial_have_percentile_median_and_sensitivity(monkeypatch):
+    """Inputs without an effect are not named, and an input that duplicates another input counts once.
+
+    Categories have the fraction of trials with the same category instead of a percentile. Failed trials can be
+    explained, but do not count in the sensitivities.
+    """
     angle = np.linspace(0.0, 2.0, 401)
     rate = np.random.default_rng(0).permutation(401) / 400.0
     table = pl.DataFrame({

@@ -19,6 +19,7 @@ FOLLOWING = f'{MULTIPLICATIVE}[reference]\nkind = "table"\nfile = "profile.csv"\
 
 
 def test_simulate_writes_an_ephemeris_that_is_a_reference_of_another_run(command, tmp_path):
+    """The ephemeris has the rows of trajectory.csv, which can be a reference too."""
     (tmp_path / "s.toml").write_text(MULTIPLICATIVE.replace("[loop]", '[loop]\nepoch = "2026-03-20T12:00:00"'))
     status, _, err = command("simulate", "s.toml", "--aem", "--no-figures", "--quiet", "--out", "r")
     assert (status, err) == (0, "")

@@ -47,6 +47,7 @@ PLANTS = {"chain": (SHORT_CHAIN, "3 u"), "spacecraft": (SHORT, "30 N m")}
 
 @pytest.mark.parametrize("plant", short(PLANTS, ["chain"]))
 def test_montecarlo_writes_rows_summary_and_figures(command, tmp_path, monkeypatch, plant):
+    """Output, page and summary agree with the statistics of the rows."""
     text, limit = PLANTS[plant]
     (tmp_path / "s.toml").write_text(text)
     monkeypatch.setattr(progress, "INTERVAL", 0.05)
@@ -213,7 +214,10 @@ def test_until_confident_needs_requirements(command, tmp_path):
 
 
 def test_until_confident_stops_at_the_required_interval_width(command, tmp_path):
-    """The width is about 4 sqrt(p (1 - p) / n), so 0.1 needs 400 trials."""
+    """The width is about 4 sqrt(p (1 - p) / n), so 0.1 needs 400 trials.
+
+    A repeated command simulates no more trials. Existing trials count, and the campaign stops at the next check.
+    """
     (tmp_path / "s.toml").write_text(HALF)
     code, said, _ = command("montecarlo", "s.toml", "--until-confident", "0.11", "--trials", 5000, "--no-figures")
     found = summary(tmp_path / FOLDER)
@@ -341,6 +345,7 @@ def test_a_scenario_that_changed_after_the_campaign_is_reported_as_changed(comma
 
 
 def test_worst_lists_trials_that_replay_reproduces(command, simulated, tmp_path):
+    """The nearest name of a metric is suggested. A trial that is not in the campaign is refused."""
     whole = rows_of(simulated)
     code, said, _ = command("worst", FOLDER, "--by", "peak_torque", "-n", 3)
     kept = pl.read_csv(simulated / "worst.csv")
@@ -442,6 +447,7 @@ def lost(monkeypatch):
 
 
 def test_failed_trials_are_counted_with_reason_and_time(command, tmp_path, lost):
+    """They count as failures of the requirement, and `ptsmc worst` lists them first."""
     lost()
     code, said, _ = command("montecarlo", "s.toml", "--trials", 250)
     found = summary(tmp_path / FOLDER)
@@ -466,7 +472,10 @@ def test_failed_trial_sets_the_exit_status_without_requirements(command, tmp_pat
 
 
 def test_single_precision_campaign_has_nearly_equal_rows(command, tmp_path, monkeypatch):
-    """The option sets JAX to 32 bits. The test sets them by itself, because JAX is configured already."""
+    """The option sets JAX to 32 bits. The test sets them by itself, because JAX is configured already.
+
+    A replay uses 32 bits too. The folder is refused for a campaign with 64 bits.
+    """
     asked = []
     monkeypatch.setattr("ptsmc_jax.configure.configure", lambda **told: asked.append(told))
     run = ("montecarlo", "s.toml", "--trials", MANY, "--no-figures", "--quiet")

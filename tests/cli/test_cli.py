@@ -33,6 +33,7 @@ from tuning.studies import compare, judging, single, stability
 
 
 def test_simulate_writes_its_result_folder(command, tmp_path):
+    """Output, history and summary agree. An existing folder is refused without --force."""
     status, out, err = command("simulate", "s.toml", "--trial", 3, "--seed", 7)
     assert (status, err) == (0, "")
     folder = tmp_path / "out" / "simulate-s"
@@ -80,6 +81,10 @@ def test_simulate_writes_its_result_folder(command, tmp_path):
 # `test_interrupted_search_writes_its_best_gains_and_resumes` tunes a chain
 @pytest.mark.parametrize("text", short([SHORT_CHAIN, SHORT], [SHORT]), ids=["chain", "spacecraft"])
 def test_tune_command_writes_its_results_and_a_second_call_shows_them(command, tmp_path, monkeypatch, text):
+    """tuned.toml reproduces the held-out trials. The tuned gains are more accurate than the gains before the search.
+
+    The page has gains, margins and lower bound. Another seed and a damaged summary are refused.
+    """
     small_search(monkeypatch)
     (tmp_path / "s.toml").write_text(text)
     status, _, _ = command("tune", "s.toml", "--out", "t")
@@ -153,6 +158,10 @@ def test_tune_command_writes_its_results_and_a_second_call_shows_them(command, t
 # here, because the search above compiled the same programs
 @pytest.mark.parametrize("others", short([[], ["pd"]], [[]]))
 def test_compare_command_writes_its_results(command, tmp_path, monkeypatch, others):
+    """The written scenario of each law reproduces its error, margins and gains.
+
+    A second call shows the results again.
+    """
     small_search(monkeypatch)
     monkeypatch.setattr(
         compare, "law_kinds", lambda: [compare.OURS, *others]
@@ -264,7 +273,10 @@ def history_of(folder):
 
 
 def test_simulate_without_a_file_runs_case_one_of_the_paper(command, tmp_path):
-    """The first row is that of theory.md 3.3, and the summary equals the metrics of the history."""
+    """The first row is that of theory.md 3.3, and the summary equals the metrics of the history.
+
+    No figures are written, and the times increase from 0 to t_end.
+    """
     assert command("simulate", "--quiet", "--no-figures") == (0, "", "")
     folder = tmp_path / "out" / "simulate-default"
     assert set(tree(folder)) == {"trajectory.csv", "summary.json", "scenario.toml", "versions.json"}
@@ -376,7 +388,11 @@ def stop_at(monkeypatch, call):
 
 @pytest.mark.parametrize("calls", short([[1, 4], [7]], [[1, 4]]))
 def test_interrupted_search_writes_its_best_gains_and_resumes(command, tmp_path, monkeypatch, calls):
-    """The first evaluation is before any result. Later ones are in the middle of a local search."""
+    """The first evaluation is before any result. Later ones are in the middle of a local search.
+
+    The resumed search reads earlier evaluations from the journal and ends with the result of a search without
+    interruption.
+    """
     small_search(monkeypatch)
     (tmp_path / "s.toml").write_text(SHORT_CHAIN.replace("steps = 4", "steps = 2"))
     with monkeypatch.context() as patch:

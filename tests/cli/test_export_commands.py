@@ -74,7 +74,11 @@ def test_parameters_of_an_exported_controller_that_differ_from_the_scenario_are_
 
 @needs_compiler
 def test_campaign_runs_the_exported_controller_and_copies_it(command, tmp_path):
-    """Rows equal those of the simulated law with the gains of the C code, to rounding, and count sample statuses."""
+    """Rows equal those of the simulated law with the gains of the C code, to rounding, and count sample statuses.
+
+    A different gain of the scenario causes a warning. A replay runs the copied C code only with --trust and only if it
+    has not changed. C code of the user is not overwritten.
+    """
     text = SHORT_CHAIN.replace('mode = "sampled"', 'mode = "sampled"\nclock = "flight"')
     (tmp_path / "of_c.toml").write_text(text)
     (tmp_path / "s.toml").write_text(text.replace("[controller]", "[controller]\neta = 2.9"))

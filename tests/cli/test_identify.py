@@ -39,6 +39,7 @@ def logged(command, tmp_path):
 
 
 def test_identify_finds_the_parameters_of_a_simulated_run_and_writes_its_files(command, logged):
+    """identified.toml has the estimate and a dispersion of its standard deviation, and can be simulated."""
     log = "run/trajectory.csv"
     status, out, err = command("identify", "s.toml", log, "--validate", log, "--out", "found")
     assert status == 0, err

@@ -211,6 +211,7 @@ def test_commented_keys_of_a_new_scenario_have_their_default_values(tmp_path):
 
 
 def test_examples_are_copied_without_overwriting(command, tmp_path):
+    """With --force, changed files are replaced."""
     code, said, _ = command("examples", "mine")
     shipped = {path.name: path.read_text() for path in (ROOT / "scenarios").iterdir() if path.is_file()}
     assert {path.name: path.read_text() for path in (tmp_path / "mine").iterdir()} == shipped

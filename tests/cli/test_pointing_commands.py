@@ -75,6 +75,10 @@ def simulated(request, command, tmp_path, monkeypatch, one_by_one):
 
 
 def test_pointing_requirements_have_verdicts_budget_and_table(simulated, tmp_path):
+    """Each interpretation (mixed, temporal, ensemble) is judged by its own statistics of the rows.
+
+    The budget has the probability and the confidence of the requirement on runs.
+    """
     code, said, rows, found = simulated
     verdicts = {told["metric"]: told for told in found["verdicts"]}
     assert code == (0 if all(told["met"] for told in verdicts.values()) else 1)
@@ -117,6 +121,7 @@ def test_pointing_requirements_have_verdicts_budget_and_table(simulated, tmp_pat
 
 
 def test_worst_trials_by_a_fraction_of_time_have_the_smallest_fractions(command, simulated, tmp_path):
+    """The quantiles are those that 99.73 %, 90 % and 50 % of the runs reach."""
     _, said, rows, found = simulated
     within = rows["within_ape_boresight"].to_numpy()
     ordered = np.sort(within)

@@ -26,6 +26,7 @@ def test_run_table_of_a_dry_run_reproduces_the_campaign(command, tmp_path):
 
 
 def test_run_table_is_simulated_resumed_replayed_and_reported(command, tmp_path):
+    """Quantities that the table omits are random. A changed or damaged run table is refused without --force."""
     (tmp_path / "corners.csv").write_text(CORNERS)
     asked = ["montecarlo", "s.toml", "--runs", "corners.csv", "--no-figures"]
     code, said, _ = command(*asked)

@@ -178,7 +178,10 @@ MOMENTA = [[0.5, -0.2, 0.1, 0.3], [40.0, 0.0, 0.0, 0.0]]
 @pytest.mark.parametrize("momentum", MOMENTA)
 @pytest.mark.parametrize(("lag", "limit"), short(CHANNELS, CHANNELS[::3]))
 def test_wheels_exchange_momentum_with_the_body(momentum, lag, limit):
-    """Attitude and wheel momenta equal an independent integration."""
+    """Attitude and wheel momenta equal an independent integration.
+
+    The history has momentum and torque of each wheel. The peak momentum includes the momentum at t = 0.
+    """
     hardware_table = {"torque_lag": lag, "torque_rate_limit": limit if np.isfinite(limit) else None}
     tables = {
         "spacecraft": {"inertia": FULL_INERTIA},
@@ -429,6 +432,7 @@ def test_gradients_of_actuators_are_finite_where_functions_are_not_differentiabl
 
 
 def test_a_saturated_slew_stays_finite_and_converges_after_t_f():
+    """Its status is "not converged" at t_f, and all metrics are finite."""
     device = actuators.Actuators(torque_limit=vector(0.1), step=vector(1e-3), delay=3)
     result = fly(with_device(device, t_end=120.0))
     assert int(result.status) == rollout.NOT_CONVERGED

@@ -130,6 +130,7 @@ def test_star_tracker_misalignment_rotates_the_final_attitude_by_its_opposite():
 
 
 def test_wheels_with_scale_and_misalignment_deliver_and_store_momentum_along_their_true_axes():
+    """A failed wheel delivers no torque and keeps its momentum."""
     wheels = actuators.wheels(formulas.pyramid(), [0.5, -0.2, 0.1, 0.3])
     turned = np.array(wheels.axes) + 0.02 * np.random.default_rng(0).normal(size=(3, 4))
     scale, command = np.array([1.1, 0.9, 1.05, 0.95]), vector([0.13, -0.2, 0.25])
@@ -160,6 +161,7 @@ WHEELED = {
 
 @pytest.mark.parametrize("known", short([False, True], [True]))
 def test_other_wheels_take_over_a_failure_if_it_is_known(known):
+    """The failed wheel has no torque and constant momentum. If it is not known, the delivered torque is wrong."""
     failure = {"kind": "uniform", "earliest": 1.0, "latest": 3.0, "known": known}
     dispersion = {"wheel_failure": failure, "star_tracker_outage": {"kind": "uniform", "duration": 0.5, "latest": 3.0}}
     ready = scenario.study(scenario.from_tables({**WHEELED, "dispersion": dispersion}))

@@ -71,6 +71,7 @@ def test_verdict_on_a_claim_of_the_paper_depends_on_the_simulated_runs(made, mon
 
 
 def test_errors_in_the_formulas_of_the_paper_have_the_stated_effects(made):
+    """Each effect is a number of the reproduction, compared with its closed form or with the corrected formula."""
     values = {slip.where + slip.correct[:4]: slip.values for slip in made.slips}
     assert len(values) == len(made.slips)
     (expansion,) = [v for k, v in values.items() if k.startswith("(37)")]
@@ -126,6 +127,7 @@ def test_each_figure_has_the_number_and_the_content_of_the_paper(monkeypatch):
 
 
 def test_folder_of_the_reproduction_contains_figures_claims_and_scenarios(made, tmp_path, monkeypatch):
+    """The written scenarios have the gains of the simulated cases, and claims.md has every claim and formula error."""
     monkeypatch.setattr(Figure, "savefig", lambda self, path, **_: path.touch())  # the content is not tested here
     reproduction.write(tmp_path, made, figures=True)
     names = {path.name for path in (tmp_path / "figures").iterdir()}
@@ -151,6 +153,7 @@ def test_folder_of_the_reproduction_contains_figures_claims_and_scenarios(made, 
 
 
 def test_reproduce_command_writes_its_files_and_refuses_an_existing_folder(made, command, tmp_path, monkeypatch):
+    """The page has every claim. A scenario file is refused too."""
     monkeypatch.setattr(reproduction, "reproduce", lambda: made)  # it takes as long as all other tests of this file
     status, out, err = command("reproduce", "--no-figures")
     assert (status, err) == (0, "")

@@ -111,6 +111,7 @@ def test_default_steps_keep_modes_accurate_to_a_millionth_for_given_torques(simu
 
 
 def test_metrics_and_columns_of_the_modes_match_the_history(simulated):
+    """The peak momentum includes the momentum of the modes."""
     log, metrics = simulated.log, simulated.metrics
     size = np.sqrt(np.sum(log.x.modes.e**2 + (log.x.modes.rate / FREQUENCY) ** 2, axis=1))
     np.testing.assert_allclose(metrics["peak_modal"], size.max(), rtol=1e-13)

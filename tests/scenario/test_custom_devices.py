@@ -178,6 +178,7 @@ def test_margins_with_a_late_star_tracker_lie_between_no_delay_and_full_delay():
 
 
 def test_custom_dispersions_change_the_parts_and_appear_in_the_rows(command, here):
+    """Their rows are a valid run table, and `ptsmc montecarlo` uses them."""
     tables = {**CHAIN, "disturbance": {"kind": "sinusoid", "amplitude": [0.05]}, "dispersion": DRIFT}
     ready = scenario.study(scenario.from_tables(tables))
     assert ready.dispersion.varies
@@ -288,6 +289,7 @@ def test_custom_sensors_exclude_built_in_sensors_and_filters(tables, said):
 
 
 def test_gains_of_custom_sensors_are_tuned_and_written():
+    """They have bounds, units and a gradient of the window error, which equals finite differences."""
     tables = {**CHAIN, "sensors": {"kind": "custom", "code": "mine.py:Smoothed"}, "tune": {}}
     loaded = reading.complete(scenario.from_tables(tables))
     assert loaded.tune is not None

@@ -93,6 +93,7 @@ def test_a_class_that_is_a_registered_pytree_can_be_a_custom_part(here):
 
 
 def test_reading_a_scenario_runs_no_custom_code_and_completing_it_finds_keys_gains_and_bounds():
+    """A completed scenario stays complete after a change, and is equal after writing and reading."""
     (systems.Path("mine.py")).write_text(HEAD + "raise RuntimeError('was run')\n" + LAW)
     tables = {**CHAIN, "controller": {**MINE, "k1": 2}, "tune": {"trials": 8}}
     loaded = scenario.from_tables(tables)
@@ -137,6 +138,7 @@ def test_a_scenario_with_custom_code_can_be_pickled_before_and_after_the_code_ru
 
 
 def test_custom_gains_can_be_set_in_parts_and_in_the_scenario():
+    """Gains of a law and of an observer have names, units and present values."""
     file = ROOT / "scenarios" / "own_parts.py"
     tables = {
         **CHAIN,

@@ -103,6 +103,7 @@ def ran(folder):
 
 
 def test_summarize_worst_and_report_run_no_custom_code(command, simulated, home):
+    """They show the custom metric of the stored rows. Figures that need histories are not drawn."""
     rows = pl.read_parquet(simulated / "trials")
     code, said, error = command("summarize", FOLDER)
     assert (code, error) == (0, "")

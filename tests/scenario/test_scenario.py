@@ -263,6 +263,7 @@ peak_torque = { limit = 0.5 }
 
 
 def test_every_key_sets_a_field_of_its_part():
+    """The dispersion of the attitude and the requirements are compared too."""
     scenario: Any = from_tables(tomllib.loads(EVERYTHING))
     ready = study(scenario)
     parts = ready.parts

@@ -64,8 +64,9 @@ HIDDEN = {**TABLES, "plant": {**TABLES["plant"], "truth": "my.py:late"}}
 def test_a_true_plant_with_a_hidden_state_matches_the_matrix_exponential():
     """An input with a lag, z' = (u - z) / 0.3 s: all three states follow from the matrix exponential.
 
-    With one step per period, RK4 would have a relative error of (h / 0.3)^5 / 120 = 3e-5 in z. The steps that follow
-    from the rate of z have an error below a millionth.
+    The history has the hidden state, and the poles of the linearised loop are those of the closed form. With one step
+    per period, RK4 would have a relative error of (h / 0.3)^5 / 120 = 3e-5 in z. The steps that follow from the rate of
+    z have an error below a millionth.
     """
     ready = scenario.study(scenario.from_tables({**HIDDEN, "hardware": {"state_noise": [0.0, 0.0]}}))
     parts = ready.parts

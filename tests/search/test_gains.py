@@ -105,6 +105,7 @@ def test_an_invalid_gain_is_named_in_the_error_also_if_t_f_is_set_too(name, key)
 
 
 def test_gains_of_single_axes_have_names_and_bounds():
+    """The gain without a number is the mean of the axes. Gains of single axes take precedence over it."""
     tables = {"free": ["eta", "observer_gain"], "per_axis": True, "bounds": {"observer_gain": [1.0, 50.0]}}
     scenario, ready = wide({"tune": tables, "observer": {"gain": [3.0, 4.0, 5.0]}})
     names = gains.free_gain_names(scenario)

@@ -108,6 +108,7 @@ def test_loss_is_continuous_and_gradient_is_finite_if_delta_is_a_multiple_of_the
 
 
 def test_bounds_map_normalised_gains_to_gains_and_back():
+    """The scale of delta and of the observer gain is logarithmic. Values beyond a bound are clipped."""
     some = normalisation.Bounds(("eta", "delta", "observer_gain"), (2.05, 0.05, 0.5), (8.0, 5.0, 300.0))
     assert list(some.scale.log) == [False, True, True]
     rng = np.random.default_rng(0)
@@ -386,7 +387,8 @@ def test_a_failed_trial_is_worse_than_any_violation(far):
 def test_search_agrees_with_a_brute_force_scan(monkeypatch):
     """The scan simulates the trials of the search on a grid of both gains.
 
-    The search screens 16 other trials for harder ones instead of 4096.
+    The search ends with a hand-over on a sample and an active limit. Its progress reports, its history and its numbers
+    of simulations and gradients are checked too. The search screens 16 other trials for harder ones instead of 4096.
     """
     helpers.small_search(monkeypatch)
     monkeypatch.setattr(worst, "SCREENED", 16)
@@ -526,6 +528,7 @@ def test_a_search_without_gradients_finds_the_same_optimum(monkeypatch):
 
 
 def test_statistics_of_a_tuning_count_failed_trials_and_cover_the_others(monkeypatch):
+    """A metric whose larger values are better has a minimum and a quantile of 1 % instead of 99 %."""
     trials = simulations.simulate_trials(problem().batch_of(np.arange(8)), np.array([3.0, 0.5]))
     lost = np.array([1, 4, 6])
     trials.status[lost] = rollout.SINGULAR

@@ -315,7 +315,10 @@ def test_critical_trials_of_several_quantile_limits_are_all_kept():
 
 
 def test_the_hardest_screened_trial_is_the_worst_case_if_nothing_can_be_moved():
-    """The true inertia cannot be moved, and neither can noise."""
+    """The true inertia cannot be moved, and neither can noise.
+
+    The screened trials are no training trials, and their results keep the order of the trials.
+    """
     body = vector([10.0, 12.0, 14.0]), vector(np.eye(3)), vector(0.05), vector(0.0)
     spread = variation.Dispersion(
         {"initial_attitude": numbers.any_attitude(), "inertia": numbers.RelativeInertia(*body)}

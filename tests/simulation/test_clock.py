@@ -16,6 +16,7 @@ from tests.helpers import ticks_of, vector
 @settings(max_examples=60, deadline=None)
 @given(t_f=st.floats(5.0, 40.0), share=st.floats(0.01, 0.4), coast=st.floats(1.0, 12.0))
 def test_periods_of_an_anchored_clock_cover_the_run_with_a_sample_at_the_hand_over(t_f, share, coast):
+    """All periods except the first and the last have the full length. The sample at the hand-over has the number 0."""
     period, delta = 0.1, max(share * t_f, 0.1)
     times = clock.anchored_clock(period, t_f + coast)
     ticks = ticks_of(times, vector(t_f), vector(delta))
@@ -176,6 +177,10 @@ def test_an_anchored_clock_covers_the_run_for_any_hand_over(t_f, delta):
 
 @pytest.mark.parametrize(("t_f", "delta"), [(30.0, 0.05), (0.5, 0.001), (3000.0, 2.0), (10.0, 5.0)])
 def test_time_grid_of_the_continuous_loop_has_the_documented_nodes_and_steps(t_f, delta):
+    """Nodes are the hand-over, t_f, the end of the window and the save times.
+
+    Steps are at most proportional to the time to go. Away from these nodes, they are not much shorter than allowed.
+    """
     saves = [0.3 * t_f, t_f - delta, t_f + 0.5]
     grid = clock.graded_clock(t_f, delta, t_f + 10.0, 1.0, 1.0, 0.1, (1e-3 * t_f, 1e-3), saves)
     ticks = ticks_of(grid, vector(t_f), vector(delta))

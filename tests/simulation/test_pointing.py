@@ -108,6 +108,7 @@ OBSERVED = [(4.0, 1.0), (4.0, 0.37), (4.03, 0.1), (0.0, 2.5), (3.999, 3.0)]
 
 @pytest.mark.parametrize(("begins", "window"), OBSERVED)
 def test_pointing_indices_match_a_brute_force_evaluation(begins, window):
+    """The fractions of time within limits are compared too, for errors, means and deviations from means."""
     def check(seed):
         rng = np.random.default_rng(seed)
         error, rate = rng.normal(size=(NODES.size, 5)), 10.0 * rng.normal(size=(NODES.size, 5))
@@ -240,6 +241,7 @@ def simulated():
 
 
 def test_pointing_indices_of_a_run_match_its_history(simulated):
+    """The fractions of time within a limit are compared too. A fraction is exactly 1 if there is no limit."""
     ready, result = simulated
     frame = np.array(ready.parts.pointing.frame)
     log = result.log

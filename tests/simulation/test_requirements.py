@@ -209,6 +209,7 @@ def test_temporal_interpretation_requires_a_fraction_of_the_time_in_every_run():
 
 
 def test_mixed_interpretation_requires_a_fraction_of_the_time_of_all_runs():
+    """The confidence depends on the number of runs, because only runs are independent. A failed run counts as 0."""
     never = of_time("mixed", np.ones(852), confidence=0.9)
     assert never.met  # as many runs without a violation as for an ensemble
     assert never.shown == pytest.approx(0.1 ** (1 / 852))

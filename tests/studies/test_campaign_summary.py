@@ -60,6 +60,7 @@ def test_mixed_requirement_averages_time_fractions_and_counts_a_missing_one_as_z
 
 
 def test_failed_trial_counts_as_zero_in_quantiles_of_a_time_fraction():
+    """The quantiles mirror those of a metric whose smaller values are better."""
     told = campaign_summary._metric_statistics(
         np.array([0.9, np.nan, 0.5, 0.8]), np.array([True, False, True, True]), True
     )

@@ -40,6 +40,7 @@ def tuned(scenario):
 
 
 def test_all_laws_have_the_same_mission_requirements_and_search_settings(monkeypatch):
+    """The free gains are those of each law, and gains of the observer."""
     base = scenario.from_tables(TABLES)
     posed = compare.contenders(base)
     assert list(posed) == ["prescribed_time", *BASELINES]
@@ -151,7 +152,10 @@ def test_comparison_refuses_the_continuous_loop_and_other_plants(tables, said):
 
 
 def test_model_errors_change_the_plant_but_not_the_law(eight):
-    """The true inertia is 10 % larger or smaller, or the delay is one period longer. The design model is the same."""
+    """The true inertia is 10 % larger or smaller, or the delay is one period longer. The design model is the same.
+
+    Model errors add to those of the scenario. The results count the trials that fail with a model error.
+    """
     base = scenario.from_tables(TABLES)
     parts = scenario.study(base).parts
     others = compare.perturbed_scenarios(base)
@@ -175,7 +179,10 @@ def test_model_errors_change_the_plant_but_not_the_law(eight):
 
 
 def test_every_law_appears_in_table_page_and_figures(eight, tmp_path):
-    """There are more laws than plot colours. Tables, charts and figures show all of them."""
+    """There are more laws than plot colours. Tables, charts and figures show all of them.
+
+    Each law has its own colour and marker, and tuned and published gains have the colours of other figures.
+    """
     base = scenario.from_tables(TABLES)
     margins = {"hold": {"stable": True, "gain_margin": 7.5, "phase_margin": 40.0, "delay_margin": None,
                         "peak_sensitivity": 3.0}}  # fmt: skip
@@ -279,6 +286,7 @@ def changed(trials, status, **metrics):
 
 
 def test_statistics_of_a_compared_law_use_its_finished_trials(eight):
+    """Settling times count all trials. A law does not meet its requirements if a trial has not converged."""
     nan, ok, bad = np.nan, rollout.OK, rollout.DIVERGED
     trials = changed(eight, [ok] * 6 + [rollout.NOT_CONVERGED, bad], window_error=[1.0] * 5 + [2.0, 3.0, 99.0],
                      peak_torque=[1.0] * 5 + [2.0, 3.0, 99.0],

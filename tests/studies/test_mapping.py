@@ -165,6 +165,7 @@ def mapped():
 
 
 def test_cells_of_a_map_agree_with_separate_simulations_of_their_pair(mapped, monkeypatch):
+    """The linear error, torque and margins of a cell agree too. A delta shorter than one period is refused."""
     loaded, x, y, cells = mapped
     assert [(c.x, c.y) for c in cells] == [(a, b) for b in y.values for a in x.values]
     refused = [c for c in cells if c.status != "simulated"]
@@ -312,6 +313,7 @@ def test_period_axis_needs_the_sampled_loop():
 
 
 def test_stability_limits_are_drawn_over_period_and_delta_only():
+    """The formula is drawn only for plants of order 2 without a lag and without a filter."""
     loaded, x, y = parse_map("controller.delta=0.2:0.9:2", "loop.period=0.05:0.1:2")
     for clock, factor, label in (("anchored", 1.5, "3/2"), ("flight", 2.5, "1/2")):
         lines = mapping.stability_limit_formulas(scenario.replace(loaded, loop__clock=clock), x, y)
@@ -336,6 +338,7 @@ def test_stability_limits_are_drawn_over_period_and_delta_only():
 
 
 def test_map_command_writes_its_result_folder(command, mapped, tmp_path):
+    """Output, CSV file and page agree with the cells. Invalid axes and numbers of trials are refused."""
     loaded, _, _, cells = mapped
     (tmp_path / "c.toml").write_text(CHAIN)
     asked = ("map", "c.toml", "--x", "loop.period=0.05:0.2:2", "--y", "controller.delta=0.1:0.5:2")
@@ -384,7 +387,10 @@ MODES = ("flexible.frequency[0]=2.0:8.0:3", "controller.delta=1.0:2.0:2", FLEXIB
 
 @pytest.mark.usefixtures("not_simulated")
 def test_stability_limit_contour_separates_stable_and_unstable_pairs(monkeypatch):
-    """The logarithm of the poles is linear in frequency and delta, so that the stability limit is a straight line."""
+    """The logarithm of the poles is linear in frequency and delta, so that the stability limit is a straight line.
+
+    A sentence reports that all pairs or no pairs are stable. A map can change one number of a list.
+    """
 
     def at_ends(parts):
         law, frequency = parts.controller, np.asarray(parts.plant.frequency)

@@ -106,6 +106,10 @@ SPACECRAFT = SHORT.replace("peak_torque = 30.0", "peak_torque = 8.0")
     ("text", "limit"), short([(CHAIN, 0.55), (SPACECRAFT, 8.0)], [(CHAIN, 0.55)]), ids=["chain", "spacecraft"]
 )
 def test_pareto_command_computes_a_torque_front(command, tmp_path, monkeypatch, text, limit):
+    """The gains of each row reproduce its error and torque. Output, page and files agree.
+
+    The scenario's torque limit is a target. Its gains are at least as accurate as all known gains that keep the limit.
+    """
     small_search(monkeypatch, 60)
     (tmp_path / "s.toml").write_text(text.replace("steps = 4", "steps = 6"))
     refined, search, begun, searched = pareto.refine_targets, posing.TuningSetup.search, [], []

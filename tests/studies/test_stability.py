@@ -33,6 +33,7 @@ SCENARIOS = {"body": (SHORT, list("xyz"), 6), "chain": (CHAIN, ["u1"], 2)}  # ax
 
 @pytest.mark.parametrize("plant", short(SCENARIOS, ["chain"]))
 def test_margins_command_writes_table_figures_and_page(command, tmp_path, plant):
+    """The margin of one axis is at least the margin of all axes together."""
     text, names, seen = SCENARIOS[plant]
     (tmp_path / "s.toml").write_text(text)
     status, out, _ = command("margins", "s.toml")
@@ -127,7 +128,10 @@ def test_simulate_checks_required_margins(command, tmp_path):
 
 
 def test_run_with_a_limit_cycle_has_no_margins(command, tmp_path, monkeypatch):
-    """`theory/test_limit_cycles.py` tests the detection of limit cycles."""
+    """`theory/test_limit_cycles.py` tests the detection of limit cycles.
+
+    Required margins count as broken, also in `ptsmc simulate`.
+    """
     (tmp_path / "asks.toml").write_text(ASKS)
     monkeypatch.setattr(limit_cycles, "find", lambda *_: limit_cycles.LimitCycle(0.04, 2.0))
     status, said, _ = command("margins", "asks.toml", "--no-figures")
@@ -231,7 +235,10 @@ def with_torque_limit(limit):
 
 
 def test_saturated_command_is_reported_as_an_open_loop():
-    """The loop transfer L is zero, so that the margins are infinite, whatever the gains are."""
+    """The loop transfer L is zero, so that the margins are infinite, whatever the gains are.
+
+    With a larger torque limit, no loop is open. The loop is reported as open also if another axis makes it unstable.
+    """
     ready, course = stability.find_margins(scenario.from_tables(LIMITED))
     found = stability.summary(ready, course)
     cut = [one for one in found["before"] if one["open"]]

@@ -207,7 +207,10 @@ class Rising:
 
 
 def test_search_widens_default_bounds_of_gains_that_matter(monkeypatch):
-    """The bound of K1 is multiplied by ten, at most three times. The bound of eta stays, because eta has no effect."""
+    """The bound of K1 is multiplied by ten, at most three times. The bound of eta stays, because eta has no effect.
+
+    Bounds that the scenario states do not change.
+    """
     tables = {"controller": {"t_f": 30.0}, "tune": {"free": ["eta", "k1"]}}
     searched = list[dict[str, tuple[float, float]]]()
     monkeypatch.setattr(posing, "set_up_tuning", lambda made, *_, **__: Rising(made, searched))

@@ -87,7 +87,10 @@ GAINS = [(1.0, 0.05, 1.0, 0), (6.0, 0.02, 1.0, 0), (3.0, 0.05, 2.0, 1), (2.0, 0.
 
 @pytest.mark.parametrize(("k1", "period", "rate", "delay"), short(GAINS, GAINS[:3]))
 def test_margins_equal_those_of_an_independent_transfer_function(k1, period, rate, delay):
-    """SciPy discretises 1/s^2 with a zero-order hold and feedback kp x + kd x'; a bracketing solver finds crossings."""
+    """SciPy discretises 1/s^2 with a zero-order hold and feedback kp x + kd x'; a bracketing solver finds crossings.
+
+    The delay margin is checked by the stability of loops with a slightly shorter and a slightly longer delay.
+    """
     changes = {"controller__k1": k1, "loop__period": period, "controller__surface_rate": rate}
     _, loop, (kp, kd) = chain(**changes, hardware={"delay": delay, "state_noise": [1e-6, 1e-6]})
     found = of(loop)
