@@ -214,6 +214,7 @@ def test_newton_finds_x_2_of_a_nonlinear_rate():
 
 def test_an_invalid_system_is_refused_in_one_sentence():
     """Wrong shapes, sizes, inertias and number types, errors of its functions and missing derivatives are refused."""
+
     def F(t, x_1, x_2):  # noqa: N802
         return x_2
 

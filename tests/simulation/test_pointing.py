@@ -109,6 +109,7 @@ OBSERVED = [(4.0, 1.0), (4.0, 0.37), (4.03, 0.1), (0.0, 2.5), (3.999, 3.0)]
 @pytest.mark.parametrize(("begins", "window"), OBSERVED)
 def test_pointing_indices_match_a_brute_force_evaluation(begins, window):
     """The fractions of time within limits are compared too, for errors, means and deviations from means."""
+
     def check(seed):
         rng = np.random.default_rng(seed)
         error, rate = rng.normal(size=(NODES.size, 5)), 10.0 * rng.normal(size=(NODES.size, 5))
