@@ -90,9 +90,9 @@ def small_parts(monkeypatch):
 
 @pytest.fixture
 def command(request, tmp_path, monkeypatch, capsys):
-    """Return a function that runs `ptsmc ...` in a folder with s.toml only, and returns exit status, stdout and stderr.
+    """Return a function that runs `ptsmc` with its arguments and returns exit status, stdout and stderr.
 
-    The scenario s.toml is `SCENARIO` of the test module, or `SHORT`.
+    The current folder is `tmp_path`, with s.toml only. This scenario is `SCENARIO` of the test module, or `SHORT`.
     """
     from tests.helpers import SHORT
     from tuning.cli import main

@@ -108,7 +108,7 @@ steps = 4
 
 
 def undocumented(columns: Iterable[str]) -> set[str]:
-    """Return the columns of `trajectory.csv`, without their numbers, that docs/output_files.md does not list."""
+    """Return a set of the columns of trajectory.csv, without their numbers, that docs/output_files.md does not list."""
     page = (ROOT / "docs" / "output_files.md").read_text(encoding="utf-8")
     part = page[page.index("## Columns of trajectory.csv") : page.index("## Columns of other tables")]
     documented = {name for row in part.splitlines() for name in re.findall(r"`([a-z_]+)\d*`", row.split(" | ")[0])}
@@ -116,7 +116,7 @@ def undocumented(columns: Iterable[str]) -> set[str]:
 
 
 def untuned(text: str) -> dict[str, Any]:
-    """Return the tables of a scenario without [tune]."""
+    """Return the tables of a scenario without [tune]; text: of the scenario in TOML."""
     return {name: table for name, table in tomllib.loads(text).items() if name != "tune"}
 
 
@@ -163,7 +163,7 @@ def time_derivative(signal: Any) -> Any:
 
 
 def random_turns(smallest, largest):
-    """Return the dispersion that turns the start from the reference by an angle between these [rad]."""
+    """Return the `Dispersion` that turns the start from the reference by an angle between these [rad]."""
     return Dispersion({"initial_attitude": numbers.axis_angle(smallest, largest)})
 
 
@@ -297,7 +297,7 @@ def with_controller(run: Parts, **changes: Any) -> Parts:
 
 
 def finer(run: Parts, times: int) -> Parts:
-    """Return the same run on a time grid with `times` as many steps."""
+    """Return the parts of the same continuous run on a time grid with `times` as many steps."""
     grid = run.clock
     assert isinstance(grid, clock.Graded)
     grid = dataclasses.replace(
@@ -375,7 +375,7 @@ def small_search(monkeypatch, held_out=40):
 
 
 def same(one, other):
-    """Assert that two tables have equal integers and texts, and other numbers equal to a relative 1e-12."""
+    """Assert that two data frames have equal integers and texts, and other numbers equal to a relative 1e-12."""
     assert one.columns == other.columns
     assert_frame_equal(one.select(pl.exclude(pl.Float64)), other.select(pl.exclude(pl.Float64)))
     for name in one.select(pl.col(pl.Float64)).columns:
@@ -383,7 +383,10 @@ def same(one, other):
 
 
 def gpus() -> list[Any]:
-    """Replace `configure.devices` as if JAX had a GPU: return JAX's default device if it is set, otherwise a GPU."""
+    """Return what `configure.devices` returns if JAX has a GPU, as a replacement of this function.
+
+    This is JAX's default device if it is set, otherwise a fake GPU, in a list.
+    """
     return [configure.default_device() or SimpleNamespace(platform="gpu")]
 
 

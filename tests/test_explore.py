@@ -190,7 +190,7 @@ def test_rotated_axes_of_an_animation_match_scipy():
 
 
 def peak(result, parts):
-    """Return a custom metric: `mine`, twice the peak torque."""
+    """Return the custom metric {"mine": twice the peak torque}."""
     return {"mine": 2.0 * result.metrics.peak_torque}
 
 
@@ -269,7 +269,7 @@ class Reported(tuning.explore.Outcome):
         )
 
     def _figures(self):
-        """Return two figures by name."""
+        """Return a dict of two figures by name."""
         return dict.fromkeys("ab")
 
 

@@ -249,7 +249,7 @@ class _Law:
 
 
 class _Other(_Law):
-    """Another class with the same fields."""
+    """Another class with the same fields as `_Law`."""
 
 
 class _Pair(NamedTuple):

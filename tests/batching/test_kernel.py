@@ -231,7 +231,7 @@ def test_maxima_and_minima_in_a_kernel_propagate_nan(kernels, monkeypatch):
 
 
 def abstract_gpu():
-    """Return a context with an abstract GPU, which jax needs from 0.11 on to lower for a GPU."""
+    """Return a context manager with an abstract GPU, which jax needs from 0.11 on to lower for a GPU."""
     if not hasattr(jax.sharding, "AbstractDevice"):
         return contextlib.nullcontext()
     device = jax.sharding.AbstractDevice(device_kind="NVIDIA H200", num_cores=None, platform="gpu")

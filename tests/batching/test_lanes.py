@@ -53,7 +53,10 @@ def agree(got, expected):
 
 
 def in_loop(function):
-    """Return the function as the body of a loop of one step. Lanes evaluate it by components there."""
+    """Return a function with equal results that calls `function` in a loop of one step.
+
+    In a loop, lanes evaluate it by components.
+    """
 
     def run(*args):
         results = lax.scan(lambda carry, _: (carry, function(*args)), 0, None, length=1)[1]
@@ -361,19 +364,19 @@ BRANCHES: dict[str, tuple] = {
 
 @jax.custom_jvp
 def cubed(x):
-    """Return x^3, with the custom derivative of `_cubed_jvp`."""
+    """Return x^3 with a wrong custom derivative, see `_cubed_jvp`."""
     return x**3
 
 
 @cubed.defjvp
 def _cubed_jvp(primals, tangents):
-    """Return x^3 and a wrong tangent, 100 x dx."""
+    """Return x^3 and a wrong tangent, 100 x dx; primals: (x,), tangents: (dx,)."""
     return cubed(*primals), 100.0 * tangents[0] * primals[0]  # a wrong derivative on purpose, to detect its use
 
 
 @jax.custom_vjp
 def squared(x):
-    """Return x^2, with a wrong custom gradient, 50 x."""
+    """Return x^2 with a wrong custom gradient, 50 x."""
     return x * x
 
 

@@ -274,13 +274,13 @@ def test_lanes_evaluate_custom_derivatives_on_components():
 
 @jax.custom_jvp
 def scaled(n, x):
-    """Return n x^2, with the custom derivative of `_scaled_jvp`."""
+    """Return n x^2 with a wrong custom derivative, see `_scaled_jvp`."""
     return n * x**2
 
 
 @scaled.defjvp
 def _scaled_jvp(primals, tangents):
-    """Return n x^2 and a wrong tangent, 7 n dx."""
+    """Return n x^2 and a wrong tangent, 7 n dx; primals: (n, x), tangents: (dn, dx)."""
     return scaled(*primals), 7.0 * primals[0] * tangents[1]  # a wrong derivative on purpose, to detect its use
 
 

@@ -80,7 +80,7 @@ class EighDisturbance(ptsmc.Disturbance):
     """A sinusoidal disturbance that calls `eigh`."""
 
     def __call__(self, t, x):
-        """Return the disturbance (m,)."""
+        """Return the disturbance, (3,) for a spacecraft and (2,) for other plants."""
         return identity_by_eigh(0.01 * jnp.sin(t) * jnp.ones(3 if hasattr(x, "q") else 2))
 
 

@@ -127,7 +127,10 @@ def test_campaign_killed_at_random_times_ends_with_the_same_rows(folder, request
 
 @pytest.fixture
 def cluster(folder):
-    """Start a Dask scheduler and two workers on the loopback device, and return the processes of the workers."""
+    """Start a Dask scheduler and two workers on the loopback device; yield the list of the workers' `Popen`.
+
+    The scheduler file is cluster.json in the folder.
+    """
 
     def dask(*options):
         call = [sys.executable, "-m", "dask", *options, "--scheduler-file", "cluster.json"]

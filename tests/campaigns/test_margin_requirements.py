@@ -166,7 +166,10 @@ def sloped(asked, bounds, normalised):
 
 
 def farthest(name, values, axis):
-    """Return the worst value of a margin along an axis, the largest peak sensitivity or the smallest other margin."""
+    """Return the worst value of a margin along an axis: the largest peak sensitivity or the smallest other margin.
+
+    name: of the margin.
+    """
     return (np.max if name == "peak_sensitivity" else np.min)(np.asarray(values), axis=axis)
 
 
@@ -176,7 +179,7 @@ class Lag(ptsmc.Draw):
     count = 1
 
     def at(self, c, parts):
-        """Return the parts with another torque lag."""
+        """Return the parts with the torque lag times 1 + 0.3 c[0]."""
         lag = parts.actuators.lag * (1.0 + 0.3 * c[0])
         return dataclasses.replace(parts, actuators=dataclasses.replace(parts.actuators, lag=lag))
 

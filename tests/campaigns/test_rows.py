@@ -19,7 +19,7 @@ def frame(first, count):
 
 @pytest.fixture
 def kept(tmp_path):
-    """Return the store of a campaign's rows in a new folder."""
+    """Return a `rows.Rows`, the empty store of a campaign's rows, in a new folder."""
     return rows.Rows(tmp_path / "trials", KEY)
 
 

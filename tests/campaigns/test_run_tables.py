@@ -130,7 +130,7 @@ class Farther(ptsmc.Draw):
     count = 1
 
     def at(self, c, parts):
-        """Return the parts with another initial state."""
+        """Return the parts with the initial state times 2 + 0.1 c[0]."""
         return dataclasses.replace(parts, initial=parts.initial * (2.0 + 0.1 * c[0]))
 
 
@@ -427,7 +427,7 @@ def hardware_parts():
 
 
 def table_of(columns, rows):
-    """Return a run table of numbers with these columns and rows."""
+    """Return a run table, a data frame of numbers; columns: names, rows: lists of numbers."""
     return pl.DataFrame(rows, schema=dict.fromkeys(columns, pl.Float64), orient="row")
 
 

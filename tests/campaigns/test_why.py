@@ -18,7 +18,10 @@ from tuning.studies import campaign_folder, campaign_summary
 
 
 class Rows:
-    """A fake campaign of 401 trials with a random initial attitude. The test replaces the reading of its rows."""
+    """A fake campaign folder of 401 trials with a random initial attitude.
+
+    The test replaces the reading of its rows.
+    """
 
     custom_metric_names = ()
     scenario = scenarios.from_tables({"dispersion": {"attitude": {"kind": "uniform"}}})

@@ -358,9 +358,10 @@ def test_default_gains_are_reported_with_a_requirement_that_is_not_met(command, 
 
 
 def stop_at(monkeypatch, call):
-    """Interrupt this evaluation of the search (0: none). Return a list with an item for each computed evaluation.
+    """Interrupt the evaluation with the number `call` of the search (1: the first, 0: none).
 
-    Evaluations that are read from the journal are not in the list.
+    Return a list with an item for each computed evaluation. Evaluations that are read from the journal are not in the
+    list.
     """
     from tuning.search.evaluate import Evaluator
     from tuning.search.journal import Journal

@@ -69,7 +69,7 @@ LOADED = scenario.from_tables(tomllib.loads(SHORT_CHAIN))
 
 @pytest.fixture(autouse=True)
 def shown(monkeypatch):
-    """Replace the printed reports by empty ones, and return the list of summaries that they would show."""
+    """Replace the printed reports by empty ones; return the list of summaries whose reports are requested."""
     summaries = []
     monkeypatch.setattr(reports, "build", lambda command, summary, plant: summaries.append(summary) or EMPTY)
     return summaries

@@ -29,7 +29,7 @@ def tick(sample):
 
 
 def state(t):
-    """Return the true state at a time [s] of a body that turns at a constant rate."""
+    """Return the true state, an `AttitudeState`, at a time [s] of a body that turns at a constant rate."""
     return AttitudeState(attitude.from_rotation_vector(t * vector(RATE)), vector(RATE))
 
 

@@ -91,8 +91,8 @@ TRACKED = {"period": 0.25, "every": 4, "attitude_noise": 2e-5, "rate_noise": 2e-
 def filtered():
     """Return a function of first sample, factor of the initial error and number of samples.
 
-    It simulates 4000 trials of a body at rest, and returns errors (samples, 2, trials and axes) of attitude [rad] and
-    bias [rad/s] just after each sample.
+    It simulates 4000 trials of a body at rest, and returns errors (samples, 2, 12 000) of attitude [rad] and bias
+    [rad/s] just after each sample. The last axis has the three body axes of all trials.
     """
     period, every, noise, gyro, walk = (TRACKED[name] for name in list(TRACKED)[:5])
     found = attitude_filter.attitude_filter(TRACKED["bandwidth"], noise, gyro, walk, period, every)

@@ -36,7 +36,7 @@ DISPERSION = {
 
 
 def enlarged(parts):
-    """Return parts with more periods and integration steps, so that several runs use one compiled program."""
+    """Return the parts with 84 periods of 30 integration steps, so that several runs use one compiled program."""
     return replace(parts, clock=replace(parts.clock, count=84), substeps=30)
 
 

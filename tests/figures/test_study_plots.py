@@ -16,7 +16,7 @@ NAMES = ("window_error", "linear_window_error", "peak_torque", "largest_peak_tor
 
 
 def numbers_apart(axes):
-    """Return how many numbers the horizontal axis has, after checking that they do not overlap or touch."""
+    """Return the number of tick labels of the horizontal axis, after checking that they neither overlap nor touch."""
     axes.figure.draw_without_rendering()
     boxes = [label.get_window_extent() for label in axes.get_xticklabels() if label.get_text()]
     boxes = sorted((b for b in boxes if axes.bbox.x0 <= (b.x0 + b.x1) / 2 <= axes.bbox.x1), key=lambda b: b.x0)

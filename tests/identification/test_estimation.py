@@ -244,7 +244,7 @@ class ScriptedSearch(estimation.Search):
         self.tolerances = []
 
     def search_locally(self, z, acceleration):
-        """Return the next given result of a local search."""
+        """Return the next result of `local`, and set the acceleration noise to that of the result."""
         result = self.local.pop(0)
         self.acceleration_noise = result.acceleration_noise
         return result

@@ -36,7 +36,7 @@ SPIN = references.Spin(vector(0.1, -0.2, 0.1, np.sqrt(1 - 0.06)), vector(0.02, -
 
 
 def state(seed: int) -> AttitudeState:
-    """Return a random attitude and body rate."""
+    """Return a random attitude and body rate as an `AttitudeState`."""
     rng = np.random.default_rng(seed)
     q = rng.normal(size=4)
     q[3] = abs(q[3]) + 0.5
@@ -154,8 +154,9 @@ def test_multiplicative_error_and_rate_equal_vector_part_of_scipy_error_quaterni
 def slew(kinematics, reference, start, rate=(0.0, 0.0, 0.0), undisturbed=True, **others):
     """Return the parts of a run to a reference, without a disturbance or with the default one.
 
-    The disturbance of zero has the same type as the default one, so that both runs use one compiled program. With the
-    multiplicative error the time steps are halved.
+    start, rate: initial attitude (4,) and body rate (3,) [rad/s]. others: of `helpers.parts`. The disturbance of zero
+    has the same type as the default one, so that both runs use one compiled program. With the multiplicative error the
+    time steps are halved.
     """
     none = {"disturbance": disturbances.Sinusoid(*[jnp.zeros(3)] * 4), "rate_bound": 0.0} if undisturbed else {}
     run = parts(

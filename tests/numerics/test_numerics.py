@@ -24,7 +24,7 @@ EPS = np.finfo(float).eps
 
 @dataclass(frozen=True)
 class _Law:
-    """A law with a static field."""
+    """A law with a gain, a model and a static field."""
 
     gain: Any
     model: Any
@@ -32,7 +32,7 @@ class _Law:
 
 
 class _Other(_Law):
-    """Another class with the same fields."""
+    """Another class with the same fields as `_Law`."""
 
 
 def test_classes_with_the_same_fields_have_different_tree_structures():

@@ -14,7 +14,10 @@ NOW = vector(0.0)
 
 
 def observer(inertia=FULL_INERTIA, gain=(10.0, 4.0, 25.0), c=1e-3, start=0.0):
-    """Return a nonlinear observer of a rigid body; c: bound on the rate of d, start: initial estimation error."""
+    """Return a nonlinear observer of a rigid body.
+
+    gain: of each axis. c: bound on the rate of d. start: bound on the initial estimation error.
+    """
     return nonlinear.NonlinearObserver(rigid_body.spacecraft(inertia), jnp.asarray(gain), vector(c), vector(start))
 
 

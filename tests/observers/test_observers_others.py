@@ -22,13 +22,19 @@ GAIN, T_O, DELTA_O, MU = 0.7, 4.0, 0.2, 2.5
 
 
 def prescribed_time_observer(model: base.Plant = MASS, gain=GAIN, c=0.0, start=0.0, mu=MU, t_o=T_O, delta_o=DELTA_O):
-    """Return a prescribed-time observer of a plant with the same gain for every input."""
+    """Return a prescribed-time observer of a plant with the same gain for every input.
+
+    c: bound on the rate of d. start: bound on the initial estimation error. mu, t_o, delta_o: as in the observer.
+    """
     values = (vector([gain] * model.inputs), *map(vector, (c, start, mu)))
     return prescribed_time.PrescribedTimeObserver(model, *values, t_o=vector(t_o), delta_o=vector(delta_o))
 
 
 def finite_time_observer(model: base.Plant = MASS, gain=1.0, c=0.0, start=0.0, width=0.0):
-    """Return a finite-time observer of a plant with the same gain for every input; width: boundary layer."""
+    """Return a finite-time observer of a plant with the same gain for every input.
+
+    c: bound on the rate of d. start: bound on the initial estimation error. width: boundary layer.
+    """
     return finite_time.FiniteTimeObserver(model, vector([gain] * model.inputs), vector(c), vector(start), vector(width))
 
 

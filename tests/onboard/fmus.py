@@ -22,7 +22,7 @@ class Unit:
         self.unit = self.instance()
 
     def instance(self):
-        """Return a new instance of the FMU."""
+        """Return a new instance of the FMU, which is instantiated, but not initialised."""
         made = (FMU3Slave if self.three else FMU2Slave)(
             guid=self.described.guid, unzipDirectory=self.place, instanceName="unit",
             modelIdentifier=self.described.coSimulation.modelIdentifier,
@@ -69,7 +69,7 @@ class Unit:
         (unit or self.unit).doStep(currentCommunicationPoint=k * self.period, communicationStepSize=self.period)
 
     def names(self, causality):
-        """Return the names of all variables with this causality, such as "input"."""
+        """Return a list of the names of all variables with this causality, such as "input"."""
         return [v.name for v in self.described.modelVariables if v.causality == causality]
 
 

@@ -117,7 +117,7 @@ def test_a_period_rounded_to_32_bits_agrees_with_the_period_of_the_controller(ch
 
 
 def compiled(compiler, *arguments):
-    """Run a C compiler with these arguments and strict warnings, and return the finished process."""
+    """Run a C compiler with these arguments and strict warnings; return the finished process with its output."""
     return subprocess.run([compiler, *STRICT, *map(str, arguments)], capture_output=True, text=True, check=False)
 
 

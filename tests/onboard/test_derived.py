@@ -104,12 +104,12 @@ def put(library, name, value):
 
 
 def exported(tables, place):
-    """Export a scenario; return it with its defaults as stated values, and its compiled controller."""
+    """Export a scenario into the folder `place`; return it with its defaults as stated values, and its `Library`."""
     return scenario.reading.freeze_defaults(program(tables, place).scenario), Library(place)
 
 
 def changed(known, changes):
-    """Return the scenario with other values of keys; changes: {key: (parameter in C, value)}."""
+    """Return the scenario with other values of keys; changes: {table__key: (parameter in C, value)}."""
     plain = {key: np.asarray(value).T.tolist() if key == "wheels__axes" else np.asarray(value).tolist()
              for key, (_, value) in changes.items()}  # fmt: skip
     return scenario.replace(known, **plain)

@@ -51,7 +51,10 @@ RICH = flight(
 
 
 def made_from(tables, reference_input=False):
-    """Return the controller of a scenario for the export; reference_input: the reference is an input of it."""
+    """Return the `folder.Controller` of a scenario with these tables.
+
+    reference_input: whether the reference is an input of it.
+    """
     complete = scenario.reading.complete(scenario.from_tables(tables))
     return folder.Controller(complete, "flight", "a scenario", reference_input)
 
@@ -123,7 +126,10 @@ def loop(files, request):
 
 
 def run(loop, trial=0, count=SAMPLES):
-    """Reset both FMUs and simulate a trial; return the rows of `closed_loop`."""
+    """Reset both FMUs and simulate `count` periods of a trial; return the rows of `closed_loop`.
+
+    loop: the units of controller and plant.
+    """
     for one in loop:
         one.unit.reset()
     return closed_loop(loop, count, {"seed": SEED, "trial": trial})

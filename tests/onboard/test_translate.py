@@ -160,7 +160,7 @@ def test_inverse_of_erf_is_accurate_next_to_its_poles(tmp_path):
 
 
 def text(function, *args):
-    """Return the C statements of a function of arrays as text."""
+    """Return the C statements of a function of arrays as one text; args: as for `body`."""
     return "\n".join(body(function, *map(jnp.asarray, args))[0])
 
 

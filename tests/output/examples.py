@@ -17,7 +17,10 @@ def group(**changes: Any) -> dict[str, Any]:
 
 
 def tune(search: dict[str, Any] | None = None, trust: dict[str, Any] | None = None, **changes: Any) -> summaries.Tune:
-    """Return the summary of a tuning without requirements; search, trust: changes in these tables."""
+    """Return the summary of a tuning without requirements.
+
+    search, trust: changes in these tables. changes: other values of its fields.
+    """
     record = {
         "largest_over_limit": {}, "conflict": None, "searched_globally": False, "margins": {}, "earlier": [],
         "confirmed": [], "hardest": None, "worst_case": False, "averaged": 256, "rollouts": 1, "gradients": 1,

@@ -20,7 +20,10 @@ VOID = {"meta", "link", "img"}
 
 
 class Page(HTMLParser):
-    """Parser of a page that fails at unknown elements, event handlers and links to other files."""
+    """Parser of an HTML text that fails at unknown elements, event handlers and links to other files.
+
+    `found` is a list of (element, attributes), `images` are the sources of images, and `scripts` the texts of scripts.
+    """
 
     def __init__(self, text):
         super().__init__()
@@ -66,7 +69,7 @@ class Page(HTMLParser):
 
 
 def checked(folder):
-    """Build the page of a result folder, check everything that holds for every page, and return the parsed page."""
+    """Build the page of a result folder, check everything that holds for every page, and return it as a `Page`."""
     made = page.build(folder)
     read = Page(made)
     (policy,) = [attrs["content"] for tag, attrs in read.found if attrs.get("http-equiv") == "Content-Security-Policy"]

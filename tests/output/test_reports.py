@@ -106,7 +106,7 @@ def advice_on_margin(metric: str, limit: float, worst: float) -> Iterable[Any]:
 
 
 def verified(count: int) -> Any:
-    """Return the report of a search after this number of verifications, each at 95 % confidence."""
+    """Return the report of a search after `count` verifications of its gains, each at 95 % confidence."""
     asked = Requirement("peak_torque", 0.5, quantile=0.9, confidence=0.95)
     found = {"earlier": (count - 1) * [earlier("peak_torque")], "margins": {"peak_torque": 0.05}}
     verdict = asked.verdict(np.zeros(1000), np.ones(1000, bool)).in_summary()
@@ -450,7 +450,7 @@ def budget(simulated: int, ok: int, not_converged: int = 0) -> str:
 
 
 def most_accurate_law(pd_error: float) -> str:
-    """Return the sentence on the most accurate law of a comparison with PD, for this window error of PD."""
+    """Return the sentence on the most accurate law in a comparison with PD; pd_error: window error of PD."""
     errors = {"pd": pd_error, "prescribed_time": 4e-6}
     laws = examples.compare({name: examples.law(window_error=error) for name, error in errors.items()}).laws
     return compare_report.most_accurate_law(laws)
@@ -472,7 +472,10 @@ def quantiles_of_angles() -> list[Table]:
 
 
 def identified(**changes: Any) -> Report:
-    """Return the report of an accurate moment, an angle, a uniform phase, and a time without prior knowledge."""
+    """Return the report of an identification of a moment, an angle, a uniform phase and a time.
+
+    The moment is accurate, and the time has no prior knowledge. changes: other entries of its summary.
+    """
     moment = {"parameter": "inertia_22", "estimate": 11.999942, "std": 6e-5, "lower": 11.999824, "upper": 12.00006,
               "start": 14.4, "prior_std": 3.0, "unit": "kg m^2"}  # fmt: skip
     angle = {"parameter": "attitude_noise", "estimate": 5e-5, "std": 1e-6, "lower": 4.8e-5, "upper": 5.2e-5,
@@ -493,7 +496,10 @@ def identified(**changes: Any) -> Report:
 
 
 def approach(judged: bool) -> Report:
-    """Return the report of a loop that is unstable at one sample of the approach phase."""
+    """Return the report of margins of a loop that is unstable at one sample of the approach phase.
+
+    judged: whether the margins of this sample are judged.
+    """
     left = dict.fromkeys(("gain_up", "gain_down", "phase", "delay", "peak_sensitivity"), 6.0)
     sample = {"time_to_go": 1.0, "judged": judged, "stable": False, "open": [], "cut": [], **left, "delay": None}
     summary = {

@@ -18,7 +18,7 @@ from tuning.studies import reproduction
 
 @pytest.fixture(scope="module")
 def made():
-    """Return the reproduction of the paper: simulated cases, claims, errors in its formulas, and observers."""
+    """Return the result of `reproduction.reproduce`: cases, claims, formula errors (slips) and observers."""
     return reproduction.reproduce()
 
 

@@ -40,7 +40,7 @@ SATELLITE = {
 
 
 def body(damping=DAMPING):
-    """Return a flexible body with four modes."""
+    """Return the plant of a flexible body with four modes; damping: ratio of each mode."""
     return flexible_body.flexible(INERTIA, FREQUENCY, damping, COUPLING)
 
 

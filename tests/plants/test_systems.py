@@ -32,7 +32,10 @@ SPIN = references.Spin(vector(0.1, -0.2, 0.1, np.sqrt(1 - 0.06)), vector(0.02, -
 
 
 def spacecraft_as_system(reference, inertia=FULL_INERTIA):
-    """Return a spacecraft as a system x_1' = F, x_2' = H + G u + D d: x_1 is the error eps_1, x_2 the body rate."""
+    """Return a spacecraft as a system x_1' = F, x_2' = H + G u + D d.
+
+    x_1 is the error eps_1 (3,) to the reference, x_2 the body rate (3,).
+    """
     tensor = vector(inertia)
     inverse = jnp.linalg.inv(tensor)
 

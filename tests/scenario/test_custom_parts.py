@@ -67,7 +67,7 @@ def places(tmp_path_factory):
 def home(command, places, monkeypatch):
     """Change to a folder with a campaign whose scenario and metrics use the custom file my.py; return the folder.
 
-    The campaign runs once, and its folder is restored for each test, because results name files by their path.
+    The campaign is simulated once, and its folder is restored for each test, because results name files by their path.
     The marker that my.py writes when it runs is absent.
     """
     place, kept = places

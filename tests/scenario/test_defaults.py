@@ -163,7 +163,7 @@ class Wobble(Disturbance):
     share: float = 0.1
 
     def __call__(self, t, x):
-        """Torque (3,) [N m]."""
+        """Return the torque (3,) [N m]."""
         return jnp.stack([0.02 * jnp.sin(0.3 * t), self.share * jnp.sum(x.w**2), 0.0 * t])
 
 
@@ -183,7 +183,7 @@ class BreaksOff(Disturbance):
     """A disturbance that is NaN after 10 s."""
 
     def __call__(self, t, x):
-        """Torque (3,) [N m]."""
+        """Return the torque (3,) [N m]."""
         return jnp.where(t > 10.0, jnp.nan, 0.01) * jnp.ones(3)
 
 
@@ -350,7 +350,7 @@ class Vibration(Disturbance):
     rate: float = 1.0
 
     def __call__(self, t, x):
-        """0.01 sin(rate t) on each axis [N m]."""
+        """Return the torque 0.01 sin(rate t) on each axis, (3,) [N m]."""
         return 0.01 * jnp.sin(self.rate * t) * jnp.ones(3)
 
     def fastest(self):
@@ -375,7 +375,7 @@ class Swell(Disturbance):
     drawn: ClassVar = {"amplitude": "size", "phase": "late"}
 
     def __call__(self, t, x):
-        """Size sin(0.01 t + late) on each axis [N m]."""
+        """Return the torque size sin(0.01 t + late) on each axis, (3,) [N m]."""
         return self.size * jnp.sin(0.01 * t + self.late) * jnp.ones(3)
 
 

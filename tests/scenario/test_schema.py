@@ -112,7 +112,7 @@ BUILT_IN = [(name, tables) for name, tables in COMPLETE if "code" not in str(tab
 
 
 def leaves(tables, path=()):
-    """Yield the path and the value of every number and text in nested tables."""
+    """Yield the path, a tuple of keys and indices, and the value of every number and text in nested tables."""
     if isinstance(tables, dict | list):
         for key, value in tables.items() if isinstance(tables, dict) else enumerate(tables):
             yield from leaves(value, (*path, key))
@@ -154,7 +154,7 @@ def at_each(wanted, scenarios=BUILT_IN):
 
 
 def refusal(tables):
-    """Return the error message of an invalid scenario, or fail if it is accepted."""
+    """Return the error message of an invalid scenario; the test fails if it is accepted."""
     try:
         from_tables(tables)
     except ScenarioError as error:

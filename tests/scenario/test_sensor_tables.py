@@ -107,7 +107,7 @@ class Level(ptsmc.AttitudeSensor):
 
 
 def with_custom_sensor(**keys):
-    """Return a scenario with a star tracker, a gyro and a custom sensor with these keys."""
+    """Return a complete scenario with a star tracker, a gyro and a custom sensor with these keys."""
     table = {"kind": "custom", "code": f"{__file__}:Level", "noise": [1e-3], **keys}
     return scenario.reading.complete(read(TRACKER, table, GYRO))
 

@@ -38,7 +38,10 @@ def powers(unit: str) -> tuple[float, float]:
 
 
 def in_units(tables: Mapping[str, Any], inertia: float, time: float) -> dict[str, Any]:
-    """Return the tables of a scenario with every number in other units, according to the declared units of keys."""
+    """Return the tables of a scenario with every number in other units, according to the declared units of keys.
+
+    inertia, time: factors on numbers with these units.
+    """
     plant = tables.get("plant", {}).get("kind", "spacecraft")
     layout: Mapping[str, Any] = layouts.TABLES[plant]
     scaled = copy.deepcopy(dict(tables))

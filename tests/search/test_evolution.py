@@ -27,7 +27,7 @@ class Quadratic(Evaluator):
         self.seen = []
 
     def measure(self, problem, normalised):
-        """Return F and the constraint of normalised gains (points, gains), and record x in `seen`."""
+        """Return the `Measurement` of F and the constraint at normalised gains (points, gains); record x in `seen`."""
         x = normalised - 0.5
         self.seen.append(x)
         f = np.where(x[:, 0] > self.wall, np.nan, np.einsum("pi,ij,pj->p", x, self.matrix, x))

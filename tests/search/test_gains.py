@@ -400,7 +400,7 @@ class Shared(prescribed_time.PrescribedTime):
 
 
 def shared(parts):
-    """Return the parts with a law of the class `Shared`."""
+    """Return the parts with a law of the class `Shared` that has the gains of their law."""
     law = parts.controller
     return replace(parts, controller=Shared(**{f.name: getattr(law, f.name) for f in fields(law)}))
 

@@ -17,7 +17,7 @@ class RosenbrockEvaluator(Evaluator):
     """Rosenbrock function F = (x0 - 0.2)^2 + 100 (x1 - x0^2)^2 without limits. x2 has no effect. Points are counted."""
 
     def _answer(self, problem, normalised, *, with_gradients):
-        """Return F, no limits, and their gradients if requested."""
+        """Return a dict of F, no limits, and their gradients if requested, at normalised gains (points, 3)."""
         x0, x1, _ = normalised.T
         f, c = (x0 - 0.2) ** 2 + 100 * (x1 - x0**2) ** 2, np.full((len(normalised), 0, 8), -1.0)
         slope = np.stack([2 * (x0 - 0.2) - 400 * x0 * (x1 - x0**2), 200 * (x1 - x0**2), 0.0 * x0], axis=1)
@@ -104,7 +104,7 @@ class Conflicting(Evaluator):
         self.a, self.b, self.third = a, b, third
 
     def measure_with_gradients(self, problem, normalised):
-        """Return F and the three limits with their gradients."""
+        """Return F and the three limits with their gradients at normalised gains (points, 2)."""
         (x0, x1), zero = normalised.T, np.zeros(len(normalised))
         y, along = (x1 - 0.3) ** 2, 2.0 * (x1 - 0.3)
         c = np.stack([2.0 * (self.a - x0) + y, x0 - self.b + y, zero + self.third], axis=1)
@@ -177,7 +177,7 @@ class OfDelta(Evaluator):
         self._f_and_c = f_and_c
 
     def measure_with_gradients(self, problem, normalised):
-        """Return F and the c of all trials with their derivatives by the normalised delta."""
+        """Return F and the c of all trials with their derivatives by the normalised delta (points, 1)."""
 
         def values(share):
             return jnp.stack(self._f_and_c(self.bounds.gains(share)[0]))

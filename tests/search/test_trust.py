@@ -35,7 +35,10 @@ def moved_in_time(**limits):
 
 @pytest.fixture(scope="module")
 def quiet():
-    """Return a problem from rest without noise. The largest input is the first one, eta^2 |x| / t_f^2."""
+    """Return a problem of a double integrator from rest without noise.
+
+    The largest input is the first one, eta^2 |x| / t_f^2.
+    """
     noisy = moved_in_time(peak_torque=0.9)
     return replace(noisy, parts=replace(noisy.parts, sensors=sensors.StateSensor(jnp.zeros(2))))
 
@@ -241,7 +244,7 @@ class Steps:
         self.c, self.rollouts, self.judged = c, 0, 0
 
     def measure(self, problem, normalised):
-        """Return F and c at normalised gains (points, 1)."""
+        """Return the `Measurement` of F and c at normalised gains (points, 1)."""
         self.rollouts += len(normalised)
         self.judged += len(normalised) * (problem.margins is not None)
         f = np.where(normalised[:, 0] > 0.9, np.inf, 3.0 + normalised[:, 0])

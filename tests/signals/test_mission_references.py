@@ -30,7 +30,7 @@ TOLERANCE = 1e-9  # rad, rad/s; rounding of angles that grow to 10 rad is 1e-14
 
 
 def build_reference(table, orbit=ORBIT, **others):
-    """Return the reference of a scenario with this table [reference] and orbit."""
+    """Return the reference of a scenario with this table [reference] and orbit; others: other tables."""
     read: Any = scenario.from_tables({"orbit": orbit, "reference": table, **MULTIPLICATIVE, **others})
     return read.reference.build(read)
 
@@ -49,7 +49,7 @@ def state(t, orbit=ORBIT):
 
 
 def unit_rate(p, p_dot):
-    """Return the unit vector along p, and its time derivative."""
+    """Return the unit vector along p (3,), and its time derivative; p_dot: derivative of p."""
     size = np.linalg.norm(p)
     return p / size, p_dot / size - p * (p @ p_dot) / size**3
 

@@ -36,7 +36,7 @@ def simulated(**changes):
 
 @pytest.fixture(scope="module", params=short(["continuous", "sampled", "flight"], ["continuous", "sampled"]))
 def run(request):
-    """Return parts, metrics and history of a continuous or a sampled run."""
+    """Return parts, metrics and history of a continuous or a sampled run, see `simulated`."""
     noisy = {"period": 0.05, "noise": (2e-4, 1e-5)}
     return simulated(**{"continuous": {}, "sampled": noisy, "flight": {**noisy, "flight": True}}[request.param])
 
@@ -142,7 +142,10 @@ def interval(t, t_next, angles, torque=0.0, delivered=None):
 
 
 def judge(intervals, t_end=4.0):
-    """Return the metrics of a run with these intervals. t_f and the window are 1 s, the settling angle is 0.1 rad."""
+    """Return the metrics of a run with these intervals, see `interval`.
+
+    t_f and the window are 1 s, and the settling angle is 0.1 rad.
+    """
     criteria = Criteria(vector(1.0), vector(t_end), vector(1.0), vector(0.1))
     running, torque = metrics.begin(Start(intervals[0].start, 3, None), criteria), jnp.zeros(3)
     for one in intervals:

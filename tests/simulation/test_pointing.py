@@ -184,7 +184,10 @@ def test_a_held_error_counts_in_the_windows_that_it_is_held_in(begins, window):
 
 
 def check_the_cone(seed):
-    """Compare the half-cone with the angle between both boresights, and the error with the rotation vector of SciPy."""
+    """Compare the half-cone with the angle between both boresights, and the error with the rotation vector of SciPy.
+
+    seed: of a random boresight, target and error.
+    """
     rng = np.random.default_rng(seed)
     b = rng.normal(size=3)
     frame = pointing.boresight_frame(b)

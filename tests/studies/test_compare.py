@@ -273,7 +273,7 @@ def eight():
 
 
 def contender(trials, **changes):
-    """Return the result of a compared law with these held-out trials."""
+    """Return the `compare.Contender` of a law with these held-out trials; changes: `verdicts` replaces the verdicts."""
     base = scenario.from_tables(TABLES)
     verdicts = judging.verdicts_of(base, trials, 0)
     return compare.Contender(base, {}, {}, {}, trials, changes.get("verdicts", verdicts), None)

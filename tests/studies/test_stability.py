@@ -161,7 +161,7 @@ def test_unstable_hold_phase_is_reported_with_negative_margins(command, tmp_path
 
 
 def reported(summary):
-    """Return the report of `ptsmc margins` for a summary."""
+    """Return the report of `ptsmc margins` for a summary, a dict."""
     return margins_report.build(summaries.read(summaries.Margins, summary))
 
 

@@ -21,7 +21,7 @@ CHAIN = {
 
 
 def find_limit_cycle(**changes):
-    """Return the limit cycle of the chain with these changes of its scenario, or None if it has none."""
+    """Return the `LimitCycle` of the chain, or None if it has none; changes: of keys, as for `scenario.replace`."""
     return limit_cycles.find(scenario.study(scenario.replace(scenario.from_tables(CHAIN), **changes)).parts)
 
 

@@ -86,7 +86,7 @@ def by_least_squares(move, push, rows, noise, prior, output, delay):
 
 
 def rms_in_window(parts, squares):
-    """Return the root of the mean of squares over the window of the run, by Simpson's rule.
+    """Return the root of the mean of squares over the window of the run, by Simpson's rule, a number.
 
     squares: values at the start, middle and end of each period, (periods, 3).
     """

@@ -39,7 +39,10 @@ CHAIN = {
 
 
 def chain(**changes):
-    """Return a chain's parts, its loop in the hold phase, and kp, kd of a = -kp x1 - kd x2."""
+    """Return a chain's parts, its loop in the hold phase, and (kp, kd) of a = -kp x1 - kd x2.
+
+    changes: of keys, as for `scenario.replace`.
+    """
     parts = scenario.study(scenario.replace(scenario.from_tables(CHAIN), **changes)).parts
     law = parts.controller
     reaching = float(law.k1) + float(parts.observer.error_bound().largest) / float(law.sign_width)
@@ -383,7 +386,10 @@ def test_phase_margin_of_each_sensor_is_accurate_for_five_integrators():
 
 
 def bears_delays_below_its_margin(loop, most=1.0):
-    """Check by poles that a loop in NumPy is stable for delays below its margin; most: largest allowed modulus."""
+    """Assert by poles that a loop in NumPy is stable for delays below the delay margin of each axis.
+
+    most: largest allowed modulus of a pole. Just above the margin, the loop must be unstable.
+    """
     for axis, border in enumerate(np.asarray(of(loop).delay) / loop.period):
         for share in np.append(np.arange(0.02, 1.0, 0.02), 0.9999):
             assert radius_late(loop, axis, share * min(border, 12.0)) < most, (axis, border, share)
