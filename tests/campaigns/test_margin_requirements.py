@@ -136,7 +136,7 @@ def loops_and_margins(parts, dispersion, seed, late):
     return jax.tree.map(lambda v: np.asarray(v)[:TRIALS], every)
 
 
-def all_of(parts, dispersion, seed, late=False):
+def exact_margins(parts, dispersion, seed, late=False):
     """Return {margin: (TRIALS, times)}, the exact margins of the first trials' loops, computed trial by trial.
 
     late: whether the loops allow delays by a fraction of a period. Otherwise the delay margin is the phase margin over
@@ -150,11 +150,11 @@ def all_of(parts, dispersion, seed, late=False):
 
 
 def worst_of(each):
-    """Return {margin: (TRIALS,)}, the worst margin of each trial over its times; each: from `all_of`."""
+    """Return {margin: (TRIALS,)}, the worst margin of each trial over its times; each: from `exact_margins`."""
     return {name: farthest(name, v, 1) for name, v in each.items()}
 
 
-def sloped(asked, bounds, normalised):
+def constraints_with_gradients(asked, bounds, normalised):
     """Return "c" (margins, entries) and "c_gradient" (margins, entries, gains) at one point of normalised gains.
 
     asked: the required margins. bounds: of the gains.
@@ -242,14 +242,14 @@ def test_margin_constraints_agree_with_verdicts_and_finite_differences(drawn):
         posed.evaluate.bounds.normalise(posed.scenario_gains),
     )
     assert asked is not None
-    found = sloped(asked, bounds, normalised)
+    found = constraints_with_gradients(asked, bounds, normalised)
     verdicts = margin_verdicts.judge_trials(posed.ready, 3)
     for row, verdict in zip(np.asarray(found["c"]), verdicts, strict=True):
         np.testing.assert_allclose(row.max() + 1.0, verdict.margin, rtol=1e-9)
     step, along = 1e-4, np.array([0.6, -0.9, 1.0, 0.7])
     points = [normalised + k * step * along for k in (-2, -1, 1, 2)]
     c = margin_rows.constraints_at_points(asked, bounds.scale, np.stack(points[:3]))["c"]  # one point more than devices
-    c = [*c, sloped(asked, bounds, points[3])["c"]]
+    c = [*c, constraints_with_gradients(asked, bounds, points[3])["c"]]
     numeric = (c[0] - 8 * c[1] + 8 * c[2] - c[3]) / (12 * step)
     slopes = np.asarray(found["c_gradient"])
     assert np.all(np.abs(slopes).reshape(-1, normalised.size).max(axis=0) > 0.0)  # every gain has an effect
@@ -262,7 +262,9 @@ def test_margin_constraints_agree_with_verdicts_and_finite_differences(drawn):
     later_failed = explore.verdicts(posed.ready.scenario, other_order, seed=3)[-2:]
     assert [v.worst for v in later_failed] == [v.worst for v in verdicts]  # later trials do not matter
     tight = dataclasses.replace(asked, limits=asked.limits * 0.9)
-    np.testing.assert_allclose(sloped(tight, bounds, normalised)["c"] + 1, (found["c"] + 1) / 0.9, rtol=1e-12)
+    np.testing.assert_allclose(
+        constraints_with_gradients(tight, bounds, normalised)["c"] + 1, (found["c"] + 1) / 0.9, rtol=1e-12
+    )
 
 
 def test_loops_that_a_torque_limit_opens_in_the_hold_phase_have_no_margins():
@@ -277,7 +279,9 @@ def test_loops_that_a_torque_limit_opens_in_the_hold_phase_have_no_margins():
     verdicts = margin_verdicts.judge_trials(dataclasses.replace(posed.ready, parts=parts), 3)
     assert [(verdict.failures, verdict.trials, verdict.met) for verdict in verdicts] == [(TRIALS, TRIALS, False)] * 2
     assert {verdict.reason for verdict in verdicts} == {"the loop is open in the hold phase in 6 trials"}
-    found = sloped(dataclasses.replace(asked, parts=parts), bounds, bounds.normalise(posed.scenario_gains))
+    found = constraints_with_gradients(
+        dataclasses.replace(asked, parts=parts), bounds, bounds.normalise(posed.scenario_gains)
+    )
     assert np.all(found["c"].max(axis=1) >= 1.0)
 
 
@@ -341,16 +345,16 @@ def test_evaluator_appends_constraints_on_the_worst_margins_of_all_trials(drawn,
     # the two hardest trials contain the worst margins of all trials
     for row, verdict in zip(c[1:], verdicts, strict=True):
         np.testing.assert_allclose(row.max() + 1.0, verdict.margin, rtol=1e-9)
-    each = worst_of(all_of(posed.ready.parts, posed.ready.dispersion, 3))
+    each = worst_of(exact_margins(posed.ready.parts, posed.ready.dispersion, 3))
     assert len(np.unique(each["gain_margin"])) == TRIALS
     # with other gains, other trials are the hardest and become the constraints
     asked = posed.problem.margins
     other = posed.scenario_gains * np.asarray([1.0, 0.2, 1.0, 1.0])  # a slow observer
     parts = with_gains(asked.parts, dict(zip(asked.names, other, strict=True)))
-    each = worst_of(all_of(parts, asked.dispersion, 3))
+    each = worst_of(exact_margins(parts, asked.dispersion, 3))
     harder, near = margin_rows.select_hardest_trials(asked, other)
     bounds = posed.evaluate.bounds
-    row = sloped(harder, bounds, bounds.normalise(other))["c"]
+    row = constraints_with_gradients(harder, bounds, bounds.normalise(other))["c"]
     np.testing.assert_allclose(row.max() + 1.0, near, rtol=1e-9)
     limits = posed.ready.margins
     shares = [violation_ratio(each[r.metric], r.limit, at_least=r.at_least) for r in limits]
@@ -406,7 +410,7 @@ def test_worst_margins_are_exact_without_exact_margins_of_all_loops(drawn, facto
     """The result equals that of exact margins of all loops. Interpolation errors are below half of `ASSUMED_ERROR`."""
     posed = drawn
     parts, dispersion = changed(posed, factors), posed.ready.dispersion
-    every = all_of(parts, dispersion, 3, late)
+    every = exact_margins(parts, dispersion, 3, late)
     _, rough = loops_and_margins(parts, dispersion, 3, late)
     period = BODY["loop"]["period"]
     for name, values in every.items():

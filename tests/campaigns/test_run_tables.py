@@ -187,7 +187,7 @@ def corners(everything):
     return table, of_run_table(made, table)
 
 
-def stands(given, table):
+def check_row_values(given, table):
     """Assert that rows of a campaign (`given`) have the values of the run table `table`."""
     assert given["run_trial"].to_list() == [5, 9]
     assert given["run_seed"].to_list() == [SEED, 11]
@@ -197,7 +197,7 @@ def stands(given, table):
 
 def test_values_of_a_run_table_are_the_inputs_of_the_trials(corners):
     table, from_table = corners
-    stands(from_table.draw(range(2)), table)
+    check_row_values(from_table.draw(range(2)), table)
 
 
 alone = programs.jit(montecarlo.one)
@@ -222,7 +222,7 @@ def test_simulation_with_parts_set_by_hand_reproduces_a_row(everything, corners,
     else:
         table, from_table = corners
         rows = from_table.simulate(range(2))
-        stands(rows, table)
+        check_row_values(rows, table)
     for row in rows.iter_rows(named=True):
         by_hand = set_by_hand(made.ready.parts, row)
         seed, trial = row.get("run_seed", SEED), row.get("run_trial", row["trial"])

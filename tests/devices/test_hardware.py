@@ -166,7 +166,7 @@ CHANNELS = [(None, np.inf), (0.2, np.inf), (0.05, np.inf), (0.1, 0.5)]
 MOST, SAMPLES = 64, 160  # integration steps per period, and periods: equal, to share one compiled program
 
 
-def as_many(ready, substeps=MOST):
+def with_equal_sizes(ready, substeps=MOST):
     """Return the study with SAMPLES periods of `substeps` integration steps, so that runs share one program."""
     timing = dataclasses.replace(ready.parts.clock, count=SAMPLES)
     return dataclasses.replace(ready, parts=dataclasses.replace(ready.parts, clock=timing, substeps=substeps))
@@ -193,7 +193,7 @@ def test_wheels_exchange_momentum_with_the_body(momentum, lag, limit):
     }
     ready = scenario.study(scenario.from_tables({**tables, "wheels": {"momentum": momentum}}))
     assert ready.parts.substeps <= MOST
-    simulated = runs.simulate(as_many(ready))
+    simulated = runs.simulate(with_equal_sizes(ready))
     log, axes, inertia = simulated.log, PYRAMID.T, np.asarray(FULL_INERTIA)
     assert log.wheels is not None
     q, h = wheels_by_an_adaptive_integrator(inertia, axes, log, lag, limit, intervals := 80)
@@ -221,7 +221,7 @@ def test_chosen_integration_steps_are_accurate_if_the_torque_changes_within_a_pe
     """The attitude equals that of 64 steps a period to 2e-9 rad in a fast slew, and to 1e-11 rad at its end."""
     ready = scenario.study(scenario.from_tables({**CUBESAT, "wheels": {}, "hardware": device}))
     assert ready.parts.substeps < 8
-    ours, fine = (runs.simulate(as_many(ready, steps)).log.x.q for steps in (ready.parts.substeps, MOST))
+    ours, fine = (runs.simulate(with_equal_sizes(ready, steps)).log.x.q for steps in (ready.parts.substeps, MOST))
     errors = (Rotation.from_quat(ours).inv() * Rotation.from_quat(fine)).magnitude()
     assert errors.max() < 2e-9
     assert errors[-1] < 1e-11

@@ -21,7 +21,7 @@ from tests.onboard.flights import FILTER, flight
 SIGMAS = 6.0
 
 
-def of(**hardware):
+def study_of(**hardware):
     """Return the study of a short scenario with an attitude filter and these keys of [hardware].
 
     The control periods are on the flight clock.
@@ -76,7 +76,7 @@ def by_hand(parts, simulated):
 @pytest.fixture(scope="module")
 def run():
     """Return the parts of a scenario at 10 Hz with a star tracker at 4 Hz, and the samples of a run."""
-    ready = of(star_tracker_period=0.25, rate_bias=1e-4)
+    ready = study_of(star_tracker_period=0.25, rate_bias=1e-4)
     parts = dataclasses.replace(ready.parts, walk_rate=None)
     simulated = vectors.simulate_many(parts, ready.dispersion, jnp.uint32(3), jnp.arange(1, dtype=jnp.uint32))
     return parts, vectors.single_trial(simulated, 0)
@@ -132,7 +132,7 @@ def test_star_tracker_measures_the_attitude_at_its_own_sample_time(run):
 
 
 def test_a_star_tracker_period_of_five_control_periods_equals_star_tracker_every_5():
-    one, other = of(star_tracker_period=0.5).parts, of(star_tracker_every=5).parts
+    one, other = study_of(star_tracker_period=0.5).parts, study_of(star_tracker_every=5).parts
     assert jax.tree.structure(one) == jax.tree.structure(other)
     jax.tree.map(np.testing.assert_array_equal, one, other)
 
@@ -200,7 +200,7 @@ def test_in_an_outage_the_filter_propagates_the_whole_period_at_once(run):
 
 def test_an_outage_removes_the_star_tracker_samples_taken_during_it():
     """The time of the measurement, 0.25 s, counts, and not the time of its use, 0.3 s."""
-    own = of(star_tracker_period=0.25).parts.sensors
+    own = study_of(star_tracker_period=0.25).parts.sensors
     now = Ticks(vector(0.3), vector(0.4), jnp.asarray(False), jnp.int32(3), vector(1.0), jnp.asarray(False))
     for outage, weight in (([0.2, 0.27], 0.0), ([0.28, 0.4], 1.0)):
         assert float(dataclasses.replace(own, outage=vector(outage)).star_weight(now)) == weight
@@ -226,7 +226,7 @@ def test_metrics_are_continuous_when_the_partial_first_period_vanishes(anchored)
 
 def test_star_tracker_moved_to_control_samples_has_the_same_correction_and_noise_per_interval():
     """The sum of the corrections in an interval is the same, and so is the sum of their noise variances."""
-    own = of(star_tracker_period=0.25).parts.sensors
+    own = study_of(star_tracker_period=0.25).parts.sensors
     often, share = own.at_control_samples(), 0.1 / 0.25
     assert often.own_times is None
     for name in ("attitude_gain", "bias_gain"):
@@ -234,11 +234,11 @@ def test_star_tracker_moved_to_control_samples_has_the_same_correction_and_noise
         np.testing.assert_allclose(each / share, gain, rtol=1e-12)
         noise, noises = float(gain * own.attitude_noise) ** 2, float(each * often.attitude_noise) ** 2
         np.testing.assert_allclose(noises / share, noise, rtol=1e-12)
-    whole = of(star_tracker_every=2).parts.sensors
+    whole = study_of(star_tracker_every=2).parts.sensors
     assert whole.at_control_samples() is whole
 
 
 def test_a_constant_gyro_bias_has_no_effect_with_the_filter():
     """The filter starts in its steady state, so that the error of its bias estimate does not depend on the bias."""
-    small, large = (runs.simulate(of(star_tracker_period=0.25, rate_bias=bias), 3, 2) for bias in (1e-9, 1e-3))
+    small, large = (runs.simulate(study_of(star_tracker_period=0.25, rate_bias=bias), 3, 2) for bias in (1e-9, 1e-3))
     np.testing.assert_allclose(large.metrics["window_error"], small.metrics["window_error"], rtol=1e-6)

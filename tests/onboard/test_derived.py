@@ -70,7 +70,7 @@ FLOWN = {
 }  # fmt: skip
 
 
-def off(known, library):
+def largest_difference(known, library):
     """Return the largest difference between commands of the compiled C and of the simulation in two trials.
 
     The difference is relative to the largest command of the trial. known: the scenario. library: its compiled
@@ -95,7 +95,7 @@ def off(known, library):
     return worst
 
 
-def put(library, name, value):
+def set_parameter(library, name, value):
     """Set a parameter of the compiled controller; name: in C, value: a number or an array of all its entries."""
     columns = library.columns["params"]
     at = [k for k, column in enumerate(columns) if column.partition("[")[0] == name]
@@ -121,11 +121,11 @@ def test_changed_parameters_in_c_give_the_commands_of_the_changed_scenario(name,
     """Rounding is 1e-16 of the largest command, or 1e-14 with a filter. The documented accuracy is 1e-12."""
     tables, changes = FLOWN[name]
     known, library = exported(tables, tmp_path / "controller")
-    assert off(known, library) < 1e-12
-    assert off(changed(known, changes), library) > 1e-3
+    assert largest_difference(known, library) < 1e-12
+    assert largest_difference(changed(known, changes), library) > 1e-3
     for parameter, value in changes.values():
-        put(library, parameter, value)
-    assert off(changed(known, changes), library) < 1e-12
+        set_parameter(library, parameter, value)
+    assert largest_difference(changed(known, changes), library) < 1e-12
 
 
 MAIN = """

@@ -23,7 +23,7 @@ def counted(x):
     return jax.lax.fori_loop(0, 30, lambda k, y: 0.9 * y + jnp.sin(x) / (k + 1.0), x)
 
 
-def gone_through(x):
+def scanned(x):
     """Return the last carry (3,) and the outputs (20, 3) of a scan over the rows of two tables; x: (3,)."""
 
     def step(total, row):
@@ -124,7 +124,7 @@ FUNCTIONS = {
         draws.normals(draws.stream(5, k, "b"), 5, k - 8), draws.streams(k, 2, ["c", "d"])[1].b), np.uint32(7)),
     "inverse of erf": (lambda x: jax.lax.erf_inv(x), np.array([-0.9, -0.3, -1e-9, 0.0, 1e-5, 0.49, 0.51, 0.99])),
     "counted loop": (counted, X),
-    "loop over a table": (gone_through, X),
+    "loop over a table": (scanned, X),
     "loop backwards": (backwards, X),
     "loop without steps": (
         lambda x: jnp.concatenate([jax.lax.scan(lambda c, r: (c * r, c), x, jnp.zeros(0))[1], x[None]]), X),

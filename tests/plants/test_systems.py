@@ -74,7 +74,7 @@ torque = jax.jit(commanded)
 
 
 @jax.jit
-def looked_at(model, t, x, u):
+def system_terms(model, t, x, u):
     """Return dF/dx_2, acceleration without force, mass matrix and generalised force of a system.
 
     x: the state (x_1, x_2). u: input.
@@ -99,7 +99,7 @@ def test_law_and_jacobians_of_a_system_match_those_derived_by_hand(seed, hold):
     np.testing.assert_allclose(surface, s, rtol=0, atol=1e-12)
     np.testing.assert_allclose(found, u, rtol=0, atol=1e-11)  # terms of some 10 N m
     # by hand: dF/dx2 = T / 2, and x_1'' without acceleration is -|w|^2 v / 4 - q_1f'' (58)
-    slope, coasting, mass, force = looked_at(own.plant, t, state, u)
+    slope, coasting, mass, force = system_terms(own.plant, t, state, u)
     np.testing.assert_allclose(slope, 0.5 * attitude.t_matrix(x.q), rtol=0, atol=1e-15)
     by_hand = -0.25 * (x.w @ x.w) * x.q[:3] - jax.jit(lambda t: attitude.vector_rates(*SPIN(t))[1])(t)
     np.testing.assert_allclose(coasting, by_hand, rtol=0, atol=1e-15)

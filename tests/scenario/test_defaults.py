@@ -36,7 +36,7 @@ def bounds(**tables):
     return law.disturbance_bound, law.disturbance_rate_bound
 
 
-def reached(disturbance, dispersion=None, count=400, spacecraft=None):
+def largest_disturbance(disturbance, dispersion=None, count=400, spacecraft=None):
     """Return the largest component of d and of d' over random times, phases and factors, by finite differences.
 
     disturbance, dispersion, spacecraft: tables of the scenario. count: number of trials.
@@ -70,7 +70,7 @@ def test_bounds_of_a_sinusoid_follow_from_amplitude_bias_and_frequency():
         "bias": [0.0, -4e-3, 1e-3],
     }
     assert bounds(disturbance=table) == (5e-3, 3e-3)
-    assert reached(table, count=1) == pytest.approx((5e-3, 3e-3), rel=1e-3)  # steps of 2.5 mrad
+    assert largest_disturbance(table, count=1) == pytest.approx((5e-3, 3e-3), rel=1e-3)  # steps of 2.5 mrad
 
 
 def test_disturbance_bounds_include_dispersions():
@@ -82,7 +82,7 @@ def test_disturbance_bounds_include_dispersions():
         "disturbance_bias": {"kind": "uniform", "half_width": 2e-3},
     }
     assert bounds(disturbance=table, dispersion=drawn) == (3.5e-3, 1.5e-3)
-    seen = reached(table, drawn, count=60)
+    seen = largest_disturbance(table, drawn, count=60)
     assert 0.9 * 3.5e-3 < seen[0] <= 3.5e-3  # the largest of 180 random pairs of uniform numbers
     assert 0.9 * 1.5e-3 < seen[1] <= 1.5e-3
     normal = {"disturbance_amplitude": {"kind": "relative_normal", "std": 0.1},

@@ -43,7 +43,7 @@ def test_margins_command_writes_table_figures_and_page(command, tmp_path, plant)
     assert out.startswith("The nominal loop is stable; smallest margins at one input in both phases: gain ")
     assert {p.name for p in (folder / "figures").iterdir()} == {"nichols.png", "sensitivity.png", "margins.png"}
     found = json.loads((folder / "summary.json").read_text())
-    of_axes(tables(folder / "margins.csv"), found, names, seen)
+    check_axes(tables(folder / "margins.csv"), found, names, seen)
     # the table has the margins of the headline
     rows = margins_report.margin_table(summaries.read(summaries.Margins, found)).rows
     at_inputs = [row for row in rows if row[0].removeprefix("worst ").startswith("input")]
@@ -62,7 +62,7 @@ def test_margins_command_writes_table_figures_and_page(command, tmp_path, plant)
     assert "margins.csv does not exist: " in refused(command, tmp_path, "report", folder)
 
 
-def of_axes(rows, found, names, seen):
+def check_axes(rows, found, names, seen):
     """Check the values of each axis and of the worst axis in the table and the summary.
 
     rows: of the table. found: the summary. names: of the axes. seen: number of sensors in the summary.
@@ -109,7 +109,7 @@ def test_margin_table_has_every_axis_and_its_summary_has_the_worst_axis(tmp_path
     (tmp_path / "made").mkdir()
     stability.write(tmp_path / "made", ready, course, figures=False)
     found = json.loads((tmp_path / "made" / "summary.json").read_text())
-    of_axes(tables(tmp_path / "made" / "margins.csv"), found, list("xyz"), 6)
+    check_axes(tables(tmp_path / "made" / "margins.csv"), found, list("xyz"), 6)
 
 
 ASKS = CHAIN.split("[requirements]")[0] + "[requirements]\ngain_margin = 1.0\nphase_margin = 89.0\n"
@@ -281,7 +281,7 @@ def test_simulate_does_not_meet_a_required_margin_of_an_open_loop_or_a_failed_ru
         assert str(verdict).startswith(f"gain_margin at least 0.1 dB: no value, as {reason}: NOT met")
 
 
-def blamed_on_no_limit(found, first, limited):
+def check_report_of_open_loop(found, first, limited):
     """Check the report of a sample that the law ignores.
 
     found: the summary. first: its entry of the sample. limited: whether the command saturates at other samples.
@@ -304,4 +304,4 @@ def test_sample_that_the_law_ignores_is_not_reported_as_saturation(limit):
     for name, value in nothing.items():
         each[name][k] = value
     found = stability.summary(ready, course._replace(at_input=course.at_input._replace(**each)))
-    blamed_on_no_limit(found, found["before"][k], limit < 1.0)
+    check_report_of_open_loop(found, found["before"][k], limit < 1.0)

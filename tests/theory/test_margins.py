@@ -385,7 +385,7 @@ def test_phase_margin_of_each_sensor_is_accurate_for_five_integrators():
         assert radius(sensor, 0.9999 * phase) < 1.0 < radius(sensor, 1.0001 * phase)
 
 
-def bears_delays_below_its_margin(loop, most=1.0):
+def check_delay_margins(loop, most=1.0):
     """Assert by poles that a loop in NumPy is stable for delays below the delay margin of each axis.
 
     most: largest allowed modulus of a pole. Just above the margin, the loop must be unstable.
@@ -399,7 +399,7 @@ def bears_delays_below_its_margin(loop, most=1.0):
 @pytest.mark.parametrize("seed", [*LATE, *AT_NYQUIST])
 def test_selected_loops_are_stable_for_all_delays_below_the_margin(seed):
     """The delay margins of these loops depend on the choice of crossings and on the range of the search."""
-    bears_delays_below_its_margin(jax.tree.map(np.asarray, drawn_loop(seed)))
+    check_delay_margins(jax.tree.map(np.asarray, drawn_loop(seed)))
 
 
 @pytest.mark.long
@@ -408,7 +408,7 @@ def test_random_loops_are_stable_for_all_delays_below_the_margin(seed):
     """A pole may leave the circle slightly between two steps of the search, which are a sixteenth of a period."""
     loop = jax.tree.map(np.asarray, drawn_loop(seed))
     if radius_late(loop, 0, 0.0) < 1.0:
-        bears_delays_below_its_margin(loop, most=1.001)
+        check_delay_margins(loop, most=1.001)
 
 
 def test_zeros_of_linear_complex_functions_on_a_grid_are_found_exactly():

@@ -127,7 +127,7 @@ def grid(t_f):
     return clock.Graded(vector(t_f + 10.0), vector(1.0), vector(1.5 * t_f / 512), jnp.zeros(0), 512, 512)
 
 
-def stays_inside_the_corrected_bounds(case):
+def check_corrected_bounds(case):
     """Check (55) with sqrt(3) c and l_m of a full inertia; (32), (20), (23) with the residual of the smooth sign.
 
     case: random values of gains, initial attitude and disturbance by name.
@@ -168,8 +168,8 @@ def stays_inside_the_corrected_bounds(case):
     assert np.all(np.linalg.norm(later.s, axis=1) <= hold_phase.sliding_bound(run, later) * (1 + 1e-4) + 1e-9)
 
 
-test_spacecraft_stays_inside = drawn(stays_inside_the_corrected_bounds, 12, case=SPACECRAFT)
-test_many_spacecraft_stay_inside = pytest.mark.long(drawn(stays_inside_the_corrected_bounds, 320, case=SPACECRAFT))
+test_spacecraft_stays_inside = drawn(check_corrected_bounds, 12, case=SPACECRAFT)
+test_many_spacecraft_stay_inside = pytest.mark.long(drawn(check_corrected_bounds, 320, case=SPACECRAFT))
 
 
 def slew(seed, eta, t_f):
