@@ -155,9 +155,9 @@ def worst_of(each):
 
 
 def constraints_with_gradients(asked, bounds, normalised):
-    """Return "c" (margins, entries) and "c_gradient" (margins, entries, gains) at one point of normalised gains.
+    """Return "c" (margins, entries) and "c_gradient" (margins, entries, gains) at one point, as a dict.
 
-    asked: the required margins. bounds: of the gains.
+    asked: the required margins. bounds: of the gains. normalised: normalised gains (gains,).
     """
     return {
         name: v[0]

@@ -275,7 +275,7 @@ def history_of(folder):
 def test_simulate_without_a_file_runs_case_one_of_the_paper(command, tmp_path):
     """The first row is that of theory.md 3.3, and the summary equals the metrics of the history.
 
-    No figures are written, and the times increase from 0 to t_end.
+    The folder has these files, the scenario and the versions. The times increase from 0 to t_end.
     """
     assert command("simulate", "--quiet", "--no-figures") == (0, "", "")
     folder = tmp_path / "out" / "simulate-default"

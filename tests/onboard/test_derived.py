@@ -73,7 +73,7 @@ FLOWN = {
 def largest_difference(known, library):
     """Return the largest difference between commands of the compiled C and of the simulation in two trials.
 
-    The difference is relative to the largest command of the trial. known: the scenario. library: its compiled
+    The difference is relative to the largest command of the trial. known: the scenario. library: the compiled
     controller.
     """
     ready = scenario.study(folder.on_flight_clock(known))

@@ -45,9 +45,10 @@ def sine(amplitude):
 
 
 def first_torque(inertia, theta, eta=ETA):
-    """Return the largest torque at t = 0 from rest, 2 eta^2 max |J n| tan(theta/2) / t_f^2 (theory 3.3).
+    """Return the largest torque at t = 0 from rest, by theory.md 3.3.
 
-    inertia: J (3, 3). theta: initial angle [rad]. The maximum is over components and axes n.
+    The torque is 2 eta^2 max |J n| tan(theta/2) / t_f^2; the maximum is over components and axes n. inertia: J (3, 3).
+    theta: initial angle [rad].
     """
     return 2 * eta**2 * np.linalg.norm(inertia, axis=1).max() * np.tan(theta / 2) / T_F**2
 

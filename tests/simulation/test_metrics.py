@@ -27,7 +27,10 @@ from tests.helpers import chain_flight, chain_parts, fly, parts, short, vector
 
 
 def simulated(**changes):
-    """Return the parts of a run, its metrics, and its history without periods of length zero; changes: of the parts."""
+    """Return the parts of a run, its metrics, and its history without periods of length zero.
+
+    changes: arguments of `helpers.parts`.
+    """
     run = parts(20.0, 3.0, 0.5, **changes)
     result = fly(run, 1, 4)
     log = result.log
@@ -193,7 +196,7 @@ def test_angles_after_t_f_use_a_parabola_through_their_squares():
 def part(squares, begin, end):
     """Return the integral over part of an interval from 2 to 2.5 s, between the fractions `begin` and `end` of it.
 
-    squares: of the error at the nodes of the interval.
+    squares: squared error at the start, in the middle and at the end of the interval.
     """
     times = (2.0 + 0.5 * begin, 9.0, 0.5 * (end - begin), 0.1)
     return integral_in_window(vector(2.0), vector(2.5), squares, Criteria(*map(vector, times)))
