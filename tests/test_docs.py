@@ -61,6 +61,7 @@ def test_reference_pages_match_the_code(name):
 
 
 def test_reference_pages_name_every_key_and_metric():
+    """They also name every field of the history."""
     scenarios, metric_list = MADE["scenarios.md"](), MADE["metrics.md"]()
     for plant, tables in layouts.TABLES.items():
         part = scenarios[scenarios.index(f"## {TITLES[plant]}") :]

@@ -56,6 +56,7 @@ def test_simulate_reads_a_file_and_raises_the_errors_of_the_command(tmp_path):
 
 
 def test_a_scenario_with_other_gains_can_be_written_and_read(flight, tmp_path):
+    """An existing file is refused without `force`. Gains that are not allowed are refused in one sentence."""
     gains = {**ptsmc_jax.gains_of(scenario.study(flight.scenario).parts), "eta": 3.5, "delta": np.float64(0.4)}
     other = ptsmc_jax.in_scenario(flight.scenario, gains)
     ptsmc_jax.write(other, tmp_path / "s.toml")
@@ -81,6 +82,7 @@ def test_a_scenario_with_other_gains_can_be_written_and_read(flight, tmp_path):
 
 
 def test_a_new_inertia_changes_the_design_model_or_only_the_true_plant(flight):
+    """The function can be traced by JAX."""
     inertia = np.array([[11.0, 0.5, 0.0], [0.5, 12.0, -0.3], [0.0, -0.3, 9.0]])
     parts = scenario.study(flight.scenario).parts
     wanted = scenario.study(scenario.replace(flight.scenario, spacecraft__inertia=inertia.tolist())).parts
@@ -143,6 +145,7 @@ def test_plot_returns_and_displays_the_figures_with_the_given_names(flight, monk
 
 
 def test_trials_returns_the_rows_of_a_campaign_and_verdicts_judges_them(flight):
+    """A diverged trial counts as a failure."""
     rows = ptsmc_jax.trials(flight.scenario, 70, seed=3)
     made = campaign.Campaign(scenario.study(flight.scenario), 3)
     assert rows.equals(made.simulate(range(70)))
@@ -168,6 +171,7 @@ def test_verdicts_accepts_all_kinds_of_scenarios_and_validates_rows(flight, tmp_
 
 
 def test_an_animation_is_one_page_without_external_files(flight, tmp_path):
+    """It needs at least two frames and a spacecraft."""
     made = flight.animate(frames=4)
     content = made._repr_html_()
     assert content.count("data:image/png;base64") == 4
@@ -274,6 +278,7 @@ class Reported(tuning.explore.Outcome):
 
 
 def test_outcome_shows_its_report_as_text_and_as_escaped_tables():
+    """Figures can be selected by name, and unknown names are refused."""
     shown = Reported()
     assert repr(shown).splitlines() == [
         "RMS <error> 1 arcsec",
@@ -299,6 +304,7 @@ def test_outcome_shows_its_report_as_text_and_as_escaped_tables():
 
 
 def test_montecarlo_simulates_the_same_rows_as_trials(flight, tmp_path):
+    """A second call in the same folder reads the rows."""
     found = tuning.montecarlo(flight.scenario, 20, seed=3, folder=tmp_path / "c")
     rows = ptsmc_jax.trials(flight.scenario, 20, seed=3)
     assert found.rows.select(rows.columns).equals(rows)
@@ -329,6 +335,7 @@ def test_a_campaign_is_refused_before_anything_is_written(tmp_path):
 
 @pytest.mark.long
 def test_tuned_gains_meet_the_requirements_in_other_trials(monkeypatch):
+    """The margins agree with those in the summary of the tuning."""
     small_search(monkeypatch)
     tuned = tuning.tune(scenario.from_tables(tomllib.loads(SHORT)))
     assert tuned.met

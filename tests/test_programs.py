@@ -57,6 +57,7 @@ def count(folder):
 
 
 def test_a_stored_program_is_traced_once_and_read_by_the_next_process(folder):
+    """Only the user can read the folder."""
     program, traced = spied()
     first = [program(X), program(2 * X)]
     assert len(traced) == 1

@@ -59,6 +59,7 @@ def campaign_with_workers(monkeypatch, tmp_path, receipt):
 
 
 def test_tls_files_are_passed_to_dask_and_require_encryption():
+    """Without files, the connection has no security options. Closing the cluster closes the client."""
     files = {"tls_ca_file": "ca.pem", "tls_client_cert": "cert.pem", "tls_client_key": "key.pem"}
     found = cluster.connect("tls://10.0.0.1:8786", files)
     security = FakeClient.made.options["security"]

@@ -24,6 +24,7 @@ def refused(folder, **options):
 @pytest.mark.parametrize("first", [False, True])
 @pytest.mark.parametrize("second", [False, True])
 def test_a_result_folder_has_one_exclusive_writer_or_several_shared_writers(tmp_path, first, second):
+    """The same holds for a link to the folder. Afterwards no lock file and no empty folder is left."""
     folder = tmp_path / "new" / "out"
     with store.lock_folder(folder, shared=first):
         assert refused(folder, shared=second) is not (first and second)
@@ -159,6 +160,7 @@ def test_shards_of_one_folder_run_at_the_same_time(command, tmp_path, monkeypatc
 
 
 def test_a_campaign_in_use_is_summarised_without_writing(command, tmp_path):
+    """The output is that of an unused campaign, with a warning."""
     asked = ("montecarlo", *ASKED, "--trials", "10", "--out", "out")
     assert command(*asked) == (0, "", "")
     _, printed, _ = command("summarize", "out", "--no-figures")

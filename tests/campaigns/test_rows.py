@@ -54,6 +54,7 @@ def test_damaged_part_file_of_a_campaign_is_detected(kept, harm):
 
 
 def test_a_part_file_of_a_campaign_is_read_once_until_it_changes(kept, monkeypatch):
+    """A change of the content is detected also if the size stays the same."""
     part = kept.write(0, frame(0, 50))
     os.utime(part.path, (1e9, 1e9))
     content, read, reads = part.path.read_bytes(), Path.read_bytes, []

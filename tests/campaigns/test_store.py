@@ -293,6 +293,7 @@ def test_toml_tables_are_read_back_exactly(tmp_path_factory, tables):
 
 
 def test_a_written_scenario_file_has_the_units_of_its_numbers_in_comments(tmp_path):
+    """Numbers without a unit have no comment, and the file is read back as the same scenario."""
     tracker = {"kind": "star_tracker", "noise_across": "8 arcsec", "noise_about": "40 arcsec"}
     raw = {
         "disturbance": {"kind": "sum", "terms": [{"kind": "constant"}, {"kind": "random_walk"}]},

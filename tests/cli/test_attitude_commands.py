@@ -49,6 +49,7 @@ def test_a_missing_file_of_the_reference_is_a_configuration_error(command, tmp_p
 
 @pytest.mark.long
 def test_tune_finds_gains_for_a_reference_from_a_file_and_copies_it(command, tmp_path, monkeypatch):
+    """The tuned scenario refers to the copy, and versions.json has the checksum of the file."""
     small_search(monkeypatch)
     content = Path(PROFILE).read_text()
     (tmp_path / "profile.csv").write_text(content)

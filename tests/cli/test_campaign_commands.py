@@ -141,6 +141,7 @@ def test_trials_that_are_simulated_again_are_not_counted_twice_in_the_progress(c
     ],
 )
 def test_another_campaign_in_the_same_folder_is_refused(command, simulated, tmp_path, change, said):
+    """With --force, the other campaign replaces the first one. Files of the user are kept."""
     (tmp_path / "m.py").write_text(OVERSHOOT)
     options = ["--seed", 3]
     if change == "eta":
@@ -285,6 +286,7 @@ def test_dry_run_writes_the_inputs_of_the_trials(command, tmp_path):
 
 
 def test_shards_in_one_folder_or_several_make_the_whole_campaign(command, simulated, tmp_path):
+    """A campaign with missing shards is reported as not finished."""
     whole, options = rows_of(simulated), ["--trials", 250, "--seed", 3, "--no-figures"]
     for k in (1, 2):
         code, said, _ = command("montecarlo", "s.toml", *options, "--shard", f"{k}/2", "--out", "one")
@@ -317,6 +319,7 @@ def test_a_shard_does_not_delete_the_rows_of_other_shards(command, tmp_path):
 
 
 def test_damaged_part_of_a_campaign_is_reported_and_simulated_again(command, simulated, tmp_path):
+    """Commands that only read the campaign refuse it. The damaged file is renamed, not deleted."""
     whole = rows_of(simulated)
     part = sorted((simulated / "trials").iterdir())[1]
     part.write_bytes(part.read_bytes()[:-100])

@@ -317,6 +317,8 @@ def test_last_row_of_the_history_is_at_t_end(command, tmp_path, timing):
 
 
 def test_seed_and_trial_select_initial_state_and_noise_of_a_run(command, tmp_path):
+    """The nominal run has the initial attitude of the file and the noise of the seed."""
+
     def fly(name, *options):
         assert command("simulate", "s.toml", "--out", name, "--quiet", "--no-figures", *options) == (0, "", "")
         return history_of(tmp_path / name)
@@ -483,6 +485,7 @@ for args in {HELP}:
 
 
 def test_exit_status_is_1_for_a_violated_requirement_and_2_for_a_configuration_error(tmp_path):
+    """Debug variables of JAX in the environment do not stop the run. A configuration error leaves no folder."""
     (tmp_path / "s.toml").write_text(SHORT_CHAIN.replace("peak_torque = 3.0", "peak_torque = 0.01"))
     run = ("simulate", tmp_path / "s.toml", "--out", tmp_path / "out", "--quiet", "--no-figures")
     # a user may set these variables to debug custom code; they must not stop a run with a NaN metric
@@ -518,6 +521,7 @@ def test_simulate_refuses_a_nominal_initial_state_at_the_singularity(command, tm
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
 def test_bash_completes_commands_and_options(command, tmp_path):
+    """Scripts for zsh, fish and PowerShell have the commands, and other shells are refused."""
     status, script, _ = command("completion", "bash")
     assert status == 0
     (tmp_path / "complete.sh").write_text(script)

@@ -23,6 +23,7 @@ def exported(tmp_path_factory):
 
 
 def test_export_writes_a_folder_and_prints_the_cost_of_a_step(command, tmp_path, exported):
+    """The files are those of `folder.export`."""
     status, out, err = command("export", "s.toml", "--trials", 1, "--out", "the c")
     assert (status, err) == (0, "")
     assert "a step takes at most" in out
@@ -157,6 +158,8 @@ def test_export_refuses_a_folder_with_files(command, tmp_path, exported):
 
 @needs_compiler
 def test_simulate_refuses_other_folders_and_controllers_of_other_scenarios(command, tmp_path, exported, monkeypatch):
+    """A continuous loop and a missing C compiler are refused too."""
+
     def said(controller):
         return refused(command, tmp_path, "simulate", "s.toml", "--controller", controller)
 

@@ -80,6 +80,7 @@ def test_keys_of_custom_classes_keep_their_order_and_are_quoted():
 
 @pytest.mark.parametrize("plant", layouts.TABLES)
 def test_new_writes_every_key_of_the_plant_with_its_meaning(plant):
+    """Tables and kinds are complete, and all metrics of the plant are named."""
     text = new.scenario_text(plant, {})
     found = blocks(text)
     names = list(layouts.TABLES[plant])
@@ -153,6 +154,7 @@ def test_commented_keys_of_a_new_scenario_are_valid(plant):
 
 
 def test_new_command_does_not_overwrite_files(command, tmp_path):
+    """With --force, it replaces the file."""
     assert command("new") == (0, "scenario in scenario.toml\n", "")
     written = (tmp_path / "scenario.toml").read_text()
     assert written == new.scenario_text(None, {})

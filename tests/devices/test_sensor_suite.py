@@ -159,6 +159,7 @@ def test_kalman_filter_of_a_sensor_suite_equals_batch_conditioning_on_all_readin
     ("interval", "latency"), list(itertools.product([1.0, 2.0, 2.5, 1.6, np.pi], [0.0, 0.3, 1.0, 2.75]))
 )
 def test_each_reading_is_used_once_at_the_first_sample_after_its_latency(interval, latency):
+    """Readings are taken at whole multiples of the interval, and not longer ago than `past_samples`."""
     times = attitude_sensors.sample_times(interval * H, latency * H, H)
     samples = jnp.arange(-40, 60)
     due, age = (
@@ -192,6 +193,7 @@ def test_a_delayed_reading_is_the_attitude_at_its_own_time():
 
 @pytest.mark.parametrize("case", ["latency", "own clocks", "outage"])
 def test_predicted_times_and_delays_of_readings_equal_the_simulated_ones(case):
+    """The gyro is always available. An outage removes readings of one star tracker only."""
     suite, count = CASES[case]().without_noise(), 40
     ticks = jax.vmap(tick)(jnp.arange(count))
     available, lag = suite.available(ticks), suite.sample_delays(ticks)

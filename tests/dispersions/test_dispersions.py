@@ -311,6 +311,7 @@ def test_relative_dispersions_scale_the_nominal_value():
 
 
 def test_amplitudes_of_disturbances_are_scaled_independently_and_a_bias_is_added():
+    """Terms without an amplitude do not change. The bias is also added to a single disturbance."""
     run = replace(PARTS, disturbance=disturbances.Sum((SINE, ORBIT, STILL)))
     added, factors = RandomNumbers("normal", vector([0.01] * 3)), RandomNumbers("uniform", vector([0.5] * 6))
     given = {"disturbance_bias": (added, [1.0, -2.0, 0.5]), "disturbance_amplitude": (factors, C[:6])}

@@ -90,6 +90,7 @@ def test_every_trial_equals_a_run_that_is_built_from_its_row_of_hardware_errors(
 
 
 def test_torque_on_the_body_has_scale_and_misalignment_that_the_flight_software_does_not_know(dispersed):
+    """The misaligned directions are unit vectors."""
     run = runs.simulate(dispersed, 5, 1)
     device = run.parts.actuators
     assert device is not None

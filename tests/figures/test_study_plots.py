@@ -95,6 +95,7 @@ def test_profiles_name_the_violated_limit_and_their_numbers_do_not_overlap(low, 
 
 @pytest.mark.parametrize(("count", "limits"), [(1, 0), (1, 6), (2, 3), (5, 4), (10, 6)])
 def test_the_legend_of_profiles_is_inside_the_figure_and_above_the_axes(count, limits):
+    """Drawing causes no warning. The legend has three entries and one for each limit."""
     metrics = (
         "peak_torque",
         "peak_torque_delivered",

@@ -85,6 +85,7 @@ def test_the_identified_model_predicts_a_log_that_was_not_used(identified):
 
 
 def test_the_identified_scenario_has_the_estimate_and_its_covariance(identified):
+    """Standard deviations and a correlation of its random inertias agree, and all these inertias are physical."""
     found, _ = identified
     again = scenario.from_tables(parsing.dump(found.identified_scenario))  # as from identified.toml
     ready = scenario.study(again)
@@ -118,6 +119,7 @@ def test_the_verdict_names_estimates_far_from_their_prior_knowledge(identified):
 
 
 def test_a_notebook_shows_the_verdict_the_estimates_and_the_figures_of_each_log(identified):
+    """A single figure can be selected. Innovations of angles are in arcsec."""
     found, _ = identified
     assert all(line in found._repr_html_() for line in found.verdict)
     assert all(label in repr(found) for label in found.problem.labels)
@@ -207,6 +209,7 @@ def test_only_phases_of_sinusoids_are_mirrored(disturbed):
 
 
 def test_a_phase_that_the_log_does_not_tell_from_its_mirror_image_is_named():
+    """The result counts as not identified, and the written scenario keeps the dispersion of the phase."""
     frame = flight(np.random.default_rng(7), disturbance=lambda t: TORQUE * np.sin(PHASES))[0]
     slow = {"kind": "sinusoid", "amplitude": 3 * [TORQUE], "frequency": 3 * [1e-6]}
     found = explore.identify(satellite(identify={}, **{**DISPERSED, "disturbance": slow}), frame)
@@ -363,6 +366,7 @@ def test_the_search_converges_if_a_log_hardly_determines_some_moments():
 
 @pytest.mark.long
 def test_a_proposed_manoeuvre_is_within_the_limits_and_as_accurate_as_expected():
+    """It is more accurate than plain slews, and reaches one of the limits. It starts and ends at rest."""
     limits = {"torque_limit": 2e-3, "momentum_limit": 4e-3}
     loaded = satellite(spacecraft={"inertia": TRUE.tolist()}, wheels={"kind": "axes", **limits})
     proposed = design.design(loaded, 60.0, rate=0.05)

@@ -120,6 +120,7 @@ def test_error_on_the_surface_reaches_zero_at_the_published_time(name, v):
 
 
 def test_signed_power_and_its_derivatives_equal_closed_forms():
+    """At x = 0, the derivative by x is 0 and the derivative by the exponent is finite."""
     x = vector([-2.0, -1e-9, 0.0, 0.5, 3.0])
     for a in (0.3, 1.0, 1.7):
         np.testing.assert_allclose(guards.signed_power(x, vector(a)), np.sign(x) * np.abs(x) ** a, rtol=1e-14)

@@ -188,6 +188,7 @@ AWAY = vector((Rotation.from_rotvec([2.9, 0.2, 0.1]) * Rotation.from_rotvec([0.5
 
 
 def test_multiplicative_error_follows_exact_solution_1_while_reference_crosses_additive_singularity():
+    """The simulated torque is that of the exact motion."""
     run = slew(KINEMATICS[1], CROSSING, AWAY, (0.03, 0.0, -0.02))
     result = fly(run)
     before = result.log.t < 19.89
@@ -205,6 +206,7 @@ def test_multiplicative_error_follows_exact_solution_1_while_reference_crosses_a
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_multiplicative_loop_does_not_depend_on_the_inertial_frame(seed):
+    """With the additive error, the motion depends on the frame."""
     turn = vector(Rotation.random(rng=np.random.default_rng(seed)).as_quat())
     run = slew(KINEMATICS[1], CROSSING, AWAY, (0.01, 0.02, 0.0), undisturbed=False)
     turned = replace(
@@ -247,6 +249,7 @@ def test_sign_of_q_does_not_change_the_path_and_additive_error_takes_the_longer_
 
 
 def test_multiplicative_error_is_singular_at_180_degrees_only():
+    """A fast initial rate away from the reference may reach 180 degrees. A sufficient condition excludes it."""
     law = parts(kinematics=KINEMATICS[1]).controller
     opposite = references.Fixed(vector(Rotation.from_rotvec([0.0, np.pi, 0.0]).as_quat()))(vector(0.0))
     near = Rotation.from_rotvec([0.0, 1e-3, 0.0])

@@ -224,6 +224,7 @@ SHORT_PAIRS = [case for case in PAIRS if case[0] == "attitude" or case[1] == "ti
 
 @pytest.mark.parametrize(("plant", "name"), helpers.short(PAIRS, SHORT_PAIRS))
 def test_input_of_a_law_gives_the_acceleration_of_the_error_that_its_paper_states(plant, name):
+    """Error, rate, sliding variable and next memory are compared too."""
     error, model, reference, x, d, start, rate = PLANTS[plant]
     law = build_law(name, error, model)
     e, w, bound = independent_error(plant, x, d)
@@ -377,6 +378,7 @@ def test_derivatives_of_a_run_include_the_memory_of_the_law(name):
 
 
 def test_time_base_profile_is_the_quintic_from_the_measured_error_to_rest():
+    """The largest acceleration from rest equals its closed form."""
     law, start = build_law("time_base_pd"), time_base.ProfileStart(jnp.ones(()), vector([1.4]), vector([-0.3]))
     profile = jax.jit(law.profile)
     for t in (0.0, 0.4, 2.5, 4.9, T_F, T_F + 1.0):
@@ -420,6 +422,7 @@ def test_rotation_vector_equals_twice_the_arc_sine():
 
 @pytest.mark.parametrize("no_feedback", [False, True])
 def test_time_base_profile_starts_at_the_first_measured_error_and_does_not_change(no_feedback):
+    """The first period is half as long. Without feedback, the command is the acceleration of the profile."""
     gains = {"k_p": 1e-13, "k_d": 1e-13} if no_feedback else {}
     law = build_law("time_base_pd", delta=0.495, **gains)  # the first period is half as long
     run = chain_run(law, START, noise=0.05)

@@ -142,6 +142,7 @@ def with_longer_clock(parts):
 
 @pytest.mark.parametrize("eta", [2.2, 3.0, 5.0])
 def test_implicit_gains_equal_the_jacobian_of_the_law_and_are_stable_for_any_delta(eta):
+    """With a delay, the smallest delta is positive, but smaller than that of explicit sampling."""
     parts = chain_parts(eta=eta, delta=H)
     law = parts.controller
     for tau in (2.1, 3.5, 20.0):

@@ -475,6 +475,7 @@ def test_derivative_of_solve_equals_closed_form():
 
 @pytest.mark.parametrize("width", [0.0, 1e-3])
 def test_signed_root_equals_its_closed_form_and_has_a_finite_derivative_at_zero(width):
+    """The derivative at 0 is 0 for the width 0, and width^-0.5 otherwise."""
     x = vector(np.array([-4.0, -1e-3, 0.0, 1e-9, 0.25]))
     got = guards.signed_root(x, vector(width))
     exact = np.asarray(x) / np.where(np.asarray(x) == 0, 1.0, (np.asarray(x) ** 2 + width**2) ** 0.25)

@@ -97,6 +97,7 @@ def test_continuous_prescribed_time_observer_error_equals_closed_form():
 
 @pytest.mark.parametrize("gain", [0.05, 0.7, 5.0])
 def test_prescribed_time_bound_is_between_1_and_2_times_the_worst_error(gain):
+    """For l = 0, the bound is the exact solution. `largest` is not exceeded at any time."""
     c, start = 0.3, 0.4
     bound = prescribed_time_observer(gain=gain, c=c, start=start).error_bound()
     for t in (0.0, 0.5, 2.0, 3.5, 3.8, 4.5, 9.0):

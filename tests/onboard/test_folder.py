@@ -51,6 +51,7 @@ def make(place, *args):
 @needs_make
 @pytest.mark.parametrize("real", ["double", "float"])
 def test_exported_c_compiles_without_warnings_and_replays_the_simulation(exported, tmp_path, real):
+    """The check fails for another gain."""
     place = shutil.copytree(exported, tmp_path / "controller")
     done = make(place, "check", f"REAL={real}")
     assert done.returncode == 0, done.stdout + done.stderr

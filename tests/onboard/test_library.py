@@ -57,6 +57,7 @@ def exported(tmp_path_factory):
 @needs_compiler
 @pytest.mark.parametrize("name", short(list(FLIGHTS), ["wheels"]))
 def test_compiled_controller_in_the_loop_equals_the_simulation(name, exported):
+    """Only the run with the compiled controller counts statuses of samples."""
     made, library = exported(name)
     ours = runs.simulate(made.ready, 3, 2)
     parts = made.ready.parts
@@ -123,6 +124,7 @@ def changed(library, samples, at, **values):
     ids=str,
 )
 def test_invalid_input_gives_a_status_and_the_last_output_and_leaves_the_state_unchanged(filtered, bad):
+    """The next sample has the status of a missed sample, and its output is that without the invalid sample."""
     library, samples = filtered
     assert not simulated(library, samples)[0].any()
     statuses, outputs = simulated(library, changed(library, samples, 10, **bad))
@@ -215,6 +217,7 @@ def test_the_age_of_an_attitude_is_clipped_to_the_period_and_must_not_be_nan(exp
 
 @needs_compiler
 def test_invalid_wheel_telemetry_is_invalid_input(exported):
+    """The next outputs are those without the invalid sample."""
     made, library = exported("wheels")
     samples, at = given(made), column_names(made.board)["in"].index("wheel_momentum[2]")
     for bad in (np.nan, np.inf, 1e9):

@@ -108,6 +108,7 @@ def test_attitude_animation_of_the_page_equals_the_simulated_attitude(simulated)
     ("diverged", "bad", "the run failed: diverged"),
 ])  # fmt: skip
 def test_the_verdict_is_the_first_content_of_the_report_page(simulated, status, mood, said):
+    """The colour of the header and the bar of the limit follow the verdict."""
     summary = json.loads((simulated / "summary.json").read_text())
     (verdict,) = (one for one in summary["verdicts"] if one["metric"] == "peak_torque")
     verdict |= {"limit": 30.0, "margin": 0.5, "met": True, "failures": 0}
@@ -288,6 +289,7 @@ def test_report_without_plotly_names_the_command_that_installs_it(command, simul
 
 
 def test_chart_of_a_long_history_has_fewer_points_and_gaps_at_values_that_are_not_finite():
+    """The chart marks t_f."""
     t = np.linspace(0.0, 50.0, 10 * page_charts.POINTS)
     columns = {"t": t, "x1": np.sin(t), "u1": np.where(t > 49.0, np.nan, t)}
     made = page_charts.history(columns, False, {"t_f": 35.0})

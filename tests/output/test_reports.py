@@ -617,6 +617,8 @@ def test_every_expected_text_of_a_report_has_a_case():
 
 
 def test_chart_of_a_front_has_intervals_knee_limit_and_no_point_without_an_error():
+    """Errors are in arcsec, and a point without an interval has a bar of length 0."""
+
     def point(peak, rms, **changes):
         return torque(peak, peak, rms, **{"interval": (0.9 * rms, 1.2 * rms), **changes})
 

@@ -26,6 +26,7 @@ INERTIAS = [np.diag(PAPER_INERTIA), np.array(FULL_INERTIA), random_body(0), rand
 
 @pytest.mark.parametrize("inertia", INERTIAS)
 def test_rates_of_a_rigid_body_follow_eulers_equation_and_the_kinematics(inertia):
+    """Gyroscopic torque and momentum are compared too."""
     rng = np.random.default_rng(4)
     body = rigid_body.spacecraft(inertia)
     for _ in range(5):

@@ -86,6 +86,7 @@ def system_terms(model, t, x, u):
 @pytest.mark.parametrize("hold", [False, True])
 @pytest.mark.parametrize("seed", short(range(4), [0]))
 def test_law_and_jacobians_of_a_system_match_those_derived_by_hand(seed, hold):
+    """The law of the system gives the torque and the sliding variable of the law for a spacecraft."""
     rng = np.random.default_rng(seed)
     run = parts(20.0, 3.5, 0.5, inertia=FULL_INERTIA, reference=SPIN, k1=1.7, sign_width=0.1, surface_rate=1.3)
     own = as_system(run, SPIN)
@@ -412,6 +413,7 @@ FILES = {
 
 
 def test_custom_files_can_import_helpers_and_cannot_exit_the_command(tmp_path):
+    """The checksum changes with the file. A system without a file has none."""
     for name, text in FILES.items():
         (tmp_path / name).write_text(text)
     assert systems.load(f"{tmp_path}/future.py:mine").inputs == 1

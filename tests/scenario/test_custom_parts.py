@@ -144,6 +144,7 @@ def test_replay_names_the_custom_file_and_runs_it_with_trust_only(command, simul
 
 
 def test_a_changed_custom_file_is_refused_even_with_trust(command, simulated, home):
+    """Its code does not run, neither in a command nor in a worker on another computer."""
     shutil.copy(home / "my.py", simulated)
     text = (simulated / "scenario.toml").read_text().replace(f"{home}/my.py", "my.py")
     (simulated / "scenario.toml").write_text(text)
@@ -173,6 +174,7 @@ def test_montecarlo_resumes_its_campaign_without_the_option_trust(command, simul
 
 
 def test_a_scenario_in_results_needs_trust_wherever_its_file_is(command, simulated, home, capsys):
+    """This holds for subfolders and links. With trust, a line names the file that runs."""
     shutil.copy(home / "my.py", simulated)
     (simulated / "evil.toml").write_text(SCENARIO)
     (simulated / "scenarios" / "deeper").mkdir(parents=True)

@@ -193,6 +193,8 @@ def test_a_custom_disturbance_that_becomes_nan_during_the_run_is_refused():
 
 
 def test_the_default_observer_gain_depends_on_inertia_and_period():
+    """The gain is proportional to the mean moment of inertia, and at most the moment over the period."""
+
     def gain(**tables):
         (value,) = set(scenario.from_tables(tables).observer.gain)
         return value

@@ -180,6 +180,7 @@ def test_the_spread_of_the_disturbance_can_have_a_torque_unit(kind, key):
 
 
 def test_only_zero_meets_a_limit_of_zero():
+    """The margin is 0 if all values are 0, and above 1 otherwise. The constraint of a search is -1."""
     tables = {"plant": {"kind": "chain"}, "requirements": {"saturated": 0}, "loop": SAMPLED}
     ready = scenario.study(scenario.from_tables(tables))
     (requirement,) = ready.requirements

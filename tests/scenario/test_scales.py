@@ -129,6 +129,7 @@ def test_noise_hides_a_boundary_layer_below_the_smallest_useful_width():
 
 
 def test_useful_boundary_layers_scale_with_the_noise():
+    """Without noise, they scale with 1 / t_f."""
     noise = 0.5 * math.hypot(1e-6, 2e-5)
     low, high = scales.width_range(flight())
     np.testing.assert_allclose([low, high], [math.sqrt(1.2) / math.pi * noise, 1e4 * noise])

@@ -145,6 +145,7 @@ def test_shortest_t_f_for_a_quantile_limit_keeps_it_in_that_fraction_of_the_tria
 
 @pytest.mark.parametrize("power", [1.0, 2.0, 3.0])
 def test_search_for_the_shortest_t_f_finds_the_last_crossing_of_the_limit(power):
+    """It returns None if no t_f keeps the limit, and accepts infinite values."""
     found = design._shortest_t_f(lambda t: t**-power + 0.02 * np.sin(t), 0.1, 3.0, 1e-3, 1e3, 1e-4, 60)
     assert found is not None
     assert found**-power + 0.02 * np.sin(found) <= 0.1

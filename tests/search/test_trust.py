@@ -56,6 +56,7 @@ def test_sensitivities_of_the_peak_torque_are_its_exponents(quiet):
 
 
 def test_the_profile_of_a_gain_without_effect_on_the_objective_is_flat(quiet):
+    """The peak torque increases with eta^2 along the profile of eta, which has the final gain as one of its points."""
     evaluate = Evaluator(BOUNDS)
     problem = replace(quiet, objective="peak_torque")
     z = BOUNDS.normalise(np.array([3.3, 1.0, 19.0]))
@@ -190,6 +191,7 @@ def test_equal_or_too_few_values_have_no_confidence_interval():
 
 @pytest.mark.long
 def test_differential_evolution_finds_the_optimum_of_the_search_with_gradients(monkeypatch):
+    """The distance is large for a search that has not left its starting point."""
     monkeypatch.setattr(global_check, "GENERATIONS", 30)
     run = parts(20.0, 3.0, 0.5, period=0.2, noise=(2e-5, 1e-6), t_end=21.0)
     run = replace(run, clock=clock.anchored_clock(0.2, 21.0))

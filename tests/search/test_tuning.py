@@ -95,6 +95,7 @@ def test_gradients_of_the_noisy_loss_agree_with_central_differences(loss):
 
 @pytest.mark.parametrize("delta", [0.5, 1.0, 2.0])
 def test_loss_is_continuous_and_gradient_is_finite_if_delta_is_a_multiple_of_the_period(loss, delta):
+    """The derivative equals one of the one-sided derivatives."""
     value, slope = loss
     points = [jnp.asarray([3.2, delta + nudge, 12.0, 20.0]) for nudge in (-1e-7, 0.0, 1e-7)]
     values, slopes = np.array([value(p) for p in points]), np.array([slope(p) for p in points])

@@ -198,6 +198,7 @@ def test_study_and_replace_accept_the_path_of_a_scenario_file(tmp_path):
 
 
 def test_metrics_print_only_metrics_that_the_run_has():
+    """An error names the existing metrics. A batch prints its shapes."""
     run = parts(8.0, 3.0, 0.5, disturbance=WAVE, period=0.1, flight=True)
     found = ptsmc.simulate_parts(run, np.uint32(0), np.uint32(0)).metrics
     shown = dict(line.split() for line in repr(found).splitlines())

@@ -299,6 +299,7 @@ def test_a_run_that_never_meets_a_limit_has_a_fraction_of_0(simulated):
 
 
 def test_pointing_knowledge_errors_without_a_filter_are_the_measurement_noise(simulated):
+    """The fraction of time within a limit is compared too."""
     ready, result = simulated
     keys = ready.parts.sensors.keys(jnp.uint32(3), jnp.uint32(5))
     samples = np.arange(50, 65)

@@ -192,6 +192,7 @@ def of_time(interpretation, within, probability=0.9973, confidence=None, ok=None
 
 
 def test_temporal_interpretation_requires_a_fraction_of_the_time_in_every_run():
+    """A failed run counts as 0. The margin is the time beyond the limit over the allowed time."""
     kept = np.full(RUNS, 1.0)
     kept[7] = 0.998
     told = of_time("temporal", kept)

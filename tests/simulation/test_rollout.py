@@ -202,6 +202,7 @@ def test_metrics_at_a_t_f_between_two_samples_use_the_motion_at_t_f(flight):
 
 
 def test_status_of_singular_and_diverged_runs():
+    """The failure has a time. Metrics of a run with a NaN state are NaN."""
     turned = np.array([0.0, 0.0, 1.0, 1e-4])
     near = fly(parts(q=turned / np.linalg.norm(turned)))
     assert int(near.status) == rollout.SINGULAR

@@ -29,6 +29,7 @@ FRAME = pl.DataFrame({
      "required: 80 % of the time, in every run; seen: at least 0 %"),
 ])  # fmt: skip
 def test_figures_mark_trials_beyond_a_limit_that_allows_this_for_some_time(interpretation, outcomes, said):
+    """A broken limit on trials has priority."""
     asked = Requirement("ape_z", 1.0, "rad", quantile=0.8, interpretation=interpretation)
     assert campaign_figures._classify_trials(FRAME, [asked])[0].tolist() == outcomes
     torque = Requirement("peak_torque", 2.0, "N m")

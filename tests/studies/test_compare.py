@@ -69,6 +69,7 @@ def test_help_of_option_against_lists_every_law():
 
 
 def test_custom_law_is_compared_with_the_requested_laws():
+    """Unknown laws are refused. The requested laws are a part of the identity of the comparison."""
     base = scenario.from_tables(TABLES)
     where = str(ROOT / "scenarios" / "own_parts.py") + ":Scaling"
     rivals = compare.Rivals(("pd",), (where,))
@@ -334,6 +335,7 @@ def rivals(monkeypatch, eight, interrupt=None):
 
 
 def test_all_laws_are_tuned_by_one_seed_and_judged_by_another(monkeypatch, eight):
+    """The status is that of the prescribed-time law. Another seed is another comparison."""
     asked = rivals(monkeypatch, eight)
     base = scenario.from_tables(TABLES)
     made = compare.compare(base, 5, lambda *told: None, None, compare.validated_contenders(base))
@@ -348,6 +350,7 @@ def test_all_laws_are_tuned_by_one_seed_and_judged_by_another(monkeypatch, eight
 
 
 def test_function_and_command_compare_the_same_laws(monkeypatch, eight):
+    """Unknown laws and other plants are refused."""
     asked = rivals(monkeypatch, eight)
     found = tuning.compare(scenario.from_tables(TABLES), against=["pd"], seed=5)
     assert [(law, seed) for what, law, seed in asked if what == "tune"] == [("prescribed_time", 5), ("pd", 5)]

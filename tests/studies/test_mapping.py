@@ -117,6 +117,7 @@ def test_an_axis_of_a_map_has_the_values_of_its_text(text, values):
 
 
 def test_labels_of_map_axes_have_the_units_of_their_keys():
+    """The label of a key without a unit is the key, and so is the label of a gain of a custom class."""
     loaded = scenario.from_tables(tomllib.loads(SHORT))
     shown = {"controller.delta": "[s]", "observer.gain[0]": "[N m s]", "hardware.rate_noise": "[rad/s]"}
     for key, unit in shown.items():

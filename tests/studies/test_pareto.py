@@ -55,6 +55,7 @@ def trials(errors):
 
 
 def test_dominated_points_of_a_front_are_worse_by_more_than_the_confidence_interval():
+    """The points are sorted by peak torque. One point that is not dominated is the knee."""
     rng = np.random.default_rng(0)
     common = rng.lognormal(0.0, 0.5, 400)
     sizes = {0.2: 4.0, 0.3: 2.0, 0.4: 2.5, 0.5: 1.0, 0.6: 1.0005}  # by peak torque

@@ -59,6 +59,7 @@ def in_hold(parts):
 
 
 def test_margins_include_the_mode_and_sensors_see_only_the_body():
+    """The gain margin about x, the axis of the mode, is smaller than that about y."""
     loop = in_hold(in_theory(controller=CALM))
     assert loop.seen.shape[1] == 6
     assert jax.eval_shape(lambda loop: margins.compute(loop, sensors=True), loop).gain_up.shape == (6,)

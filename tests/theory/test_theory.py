@@ -71,6 +71,7 @@ def test_braking_torque_of_a_small_slew_has_the_predicted_peak(eta):
 
 
 def test_boundary_layer_of_the_smallest_sign_width_is_crossed_in_one_period():
+    """The width is proportional to the period, and uses the K2 of a settled observer."""
     run = parts(30.0, 3.0, 0.05, inertia=FULL_INERTIA)
     width = envelopes.smallest_sign_width(run, 0.05)
     before, _ = envelopes.boundary_layer(run.controller, run.observer.error_bound().largest)
@@ -264,6 +265,7 @@ def test_ramp_error_equals_the_simulated_error_under_a_ramp(rate):
 
 
 def test_spacecraft_without_an_observer_stays_inside_its_envelope():
+    """K2 is the norm of the largest disturbance. The estimate is zero."""
     wave = disturbances.Sinusoid(*(vector([v] * 3) for v in (0.01, 0.4, 0.3, 0.0)))
     run = parts(30.0, 3.0, 0.5, disturbance=wave, sign_width=0.2)
     blind = dataclasses.replace(run, observer=NoObserver(run.plant, vector(0.01)))
