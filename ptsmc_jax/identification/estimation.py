@@ -31,6 +31,7 @@ from ptsmc_jax.signals import disturbances
 ROW_MULTIPLE = 256  # rows of a log are padded to a multiple of it, so that similar logs share compiled programs
 MAX_EVALUATIONS = 100  # largest number of evaluations of a local search
 MAX_COARSE_EVALUATIONS = 30  # largest number of evaluations of a preliminary search
+STRAIGHTENING_STEPS = 4  # Newton steps that find the coordinates of given numbers
 MAX_DAMPING = 1e12  # largest damping of a step
 MAX_STEP_LENGTH = 3.0  # longest step of a local search, in sigmas of the prior
 COARSE_TOLERANCE = 0.3  # largest next step that ends a preliminary search, in sigmas of the estimate
@@ -556,6 +557,21 @@ class Search:
         assert innovations is not None
         return innovations, limit
 
+    def _straighten(self, z: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Return the step (n,) whose change of the numbers is the first-order change by the given step from z (n,).
+
+        Predicted readings are nearly linear in numbers such as an inertia, but not in its coordinates. If the data
+        hardly determine a combination, the likelihood is therefore a straight ridge of the numbers only. If no
+        coordinates near the step have these numbers, the step itself is returned.
+        """
+        target, straight = self.problem.numbers(z) + self.problem.derivatives(z) @ step, step
+        for _ in range(STRAIGHTENING_STEPS):
+            missing = target - self.problem.numbers(z + straight)
+            straight = straight + np.linalg.pinv(self.problem.derivatives(z + straight)) @ missing
+            if not np.linalg.norm(straight - step) <= 0.5 * np.linalg.norm(step):
+                return step
+        return straight
+
     def maximise_likelihood(self, z: np.ndarray, logs: Sequence[PreparedLog], tolerance: float) -> SearchResult:
         """Return the result of a local search from z for the most likely parameters of these logs and the prior.
 
@@ -572,11 +588,8 @@ class Search:
         end = self._evaluations + (MAX_COARSE_EVALUATIONS if tolerance > STEP_TOLERANCE else MAX_EVALUATIONS)
         while not (converged := float(gradient @ _newton_step(gradient, information)) < tolerance**2):
             while damping < MAX_DAMPING and self._evaluations < end:
-                step = _newton_step(gradient, information, damping)
+                step = self._straighten(z, _newton_step(gradient, information, damping))
                 candidate = self.derivatives(z + step, logs, exact=exact)
-                if _is_finite(candidate) and candidate[0] < value:  # a narrow curved ridge: return to it
-                    step = step + _newton_step(candidate[1], candidate[2], damping)
-                    candidate = self.derivatives(z + step, logs, exact=exact)
                 if _is_finite(candidate) and candidate[0] >= value - 1e-9 * abs(value):
                     break
                 damping = max(10.0 * damping, 1.0)

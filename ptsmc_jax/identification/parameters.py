@@ -112,13 +112,17 @@ class Problem:
 
         return jax.jit(read)
 
+    @cached_property
+    def _jitted_derivatives(self) -> Callable[[Array], Array]:
+        return jax.jit(jax.jacfwd(self._jitted_numbers))
+
     def numbers(self, z: np.ndarray) -> np.ndarray:
         """Return the numbers of all parameters at coordinates (n,) [-], in their units."""
         return np.asarray(self._jitted_numbers(jnp.asarray(z)))
 
     def derivatives(self, z: np.ndarray) -> np.ndarray:
         """Return the derivatives (k, n) of `numbers` by the coordinates (n,) [-]."""
-        return np.asarray(jax.jacfwd(self._jitted_numbers)(jnp.asarray(z)))
+        return np.asarray(self._jitted_derivatives(jnp.asarray(z)))
 
     @property
     def labels(self) -> list[str]:
