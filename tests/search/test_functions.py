@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tuning.search import Settings, minimise
+from tuning.search import Settings, functions, minimise
 
 
 def test_minimum_of_a_quadratic_is_its_projection_on_the_box():
@@ -63,6 +63,23 @@ def test_points_with_an_undefined_objective_are_avoided():
 def test_minimise_refuses_an_empty_or_infinite_box(bounds):
     with pytest.raises(ValueError, match="bounds are"):
         minimise(lambda x: x[0], None, bounds)
+
+
+@pytest.mark.parametrize("bounds", [{"x": (0.0, 1.0)}, (0.0, 1.0), [(0.0, 0.5, 1.0)], [(0.0, 1.0), (0.0,)], []])
+def test_minimise_refuses_bounds_that_are_no_list_of_pairs(bounds):
+    with pytest.raises(TypeError, match=r"^bounds are .*, but must be a list with a pair"):
+        functions._read_bounds(bounds)  # the type checker of the tests would refuse them in `minimise`
+
+
+def test_minimise_refuses_an_objective_with_several_values():
+    with pytest.raises(ValueError, match=r"returns an array of shape \(2,\), but must return one number"):
+        minimise(lambda x: x, None, [(0.0, 1.0)] * 2)
+
+
+@pytest.mark.parametrize(("constraint", "accepted"), [(5e-5, True), (2e-4, False)])
+def test_a_constraint_of_at_most_1e_4_is_accepted(constraint, accepted):
+    found = minimise(lambda x: x[0] ** 2, lambda x: 0.0 * x[0] + constraint, [(-1.0, 1.0)], Settings(starts=1))
+    assert found.feasible == accepted
 
 
 def test_results_of_minimise_depend_on_the_seed_only():

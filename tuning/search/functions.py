@@ -84,7 +84,7 @@ class Search:
 
     @property
     def feasible(self) -> bool:
-        """Return whether the best point meets every constraint within 1e-4."""
+        """Return whether no constraint is larger than 1e-4 at the best point."""
         return self.locals[0].violation == 0.0
 
 
@@ -101,20 +101,24 @@ def minimise(
     local search first minimises the violation.
 
     Args:
-        objective: differentiable function of x (n,). It returns NaN or infinity where it is undefined.
-        constraints: differentiable function of x (n,) with values of any shape. A constraint is met if its value is at
-            most 0. Scale it so that 0.1 is a large violation. None: no constraints.
-        bounds: lower and upper bound of each element of x.
+        objective: differentiable function of x (n,) that returns one number. It returns NaN or infinity where it is
+            undefined.
+        constraints: another differentiable function of x (n,), with values of any shape. The search aims at values of
+            at most 0 and accepts values up to 1e-4. Scale each constraint so that 0.1 is a large violation. None: no
+            constraints.
+        bounds: a pair (lower, upper) for each element of x.
         settings: numbers of points, steps and the tolerance.
 
     Returns:
         The best point of each local search.
 
     Raises:
-        ValueError: A bound is not finite, a lower bound is not below its upper bound, or the objective is finite at no
-            sampled point. It is also raised if no starting point has a finite gradient.
+        TypeError: The bounds are not a list of pairs.
+        ValueError: A bound is not finite, a lower bound is not below its upper bound, or the objective does not return
+            one number. It is also raised if the objective is finite at no sampled point, or no starting point has a
+            finite gradient.
     """
-    lower, upper = np.asarray(bounds, dtype=float).T
+    lower, upper = _read_bounds(bounds)
     if not np.all(np.isfinite(upper - lower) & (lower < upper)):
         raise ValueError(f"bounds are {list(bounds)}, but must be finite, each lower one below its upper one")
 
@@ -123,8 +127,11 @@ def minimise(
 
     def evaluate(normalised: Array) -> tuple[Array, Array]:
         x = to_box(normalised)
+        f = jnp.asarray(objective(x), dtype=float)
+        if f.shape:
+            raise ValueError(f"the objective returns an array of shape {f.shape}, but must return one number")
         c = jnp.zeros(0) if constraints is None else jnp.ravel(constraints(x))
-        return jnp.asarray(objective(x), dtype=float), c[None][: min(1, c.size)]  # one row of c, or none
+        return f, c[None][: min(1, c.size)]  # one row of c, or none
 
     differentiate = jax.jit(lambda normalised: (evaluate(normalised), jax.jacfwd(evaluate)(normalised)))
 
@@ -157,3 +164,14 @@ def minimise(
         raise ValueError("the objective has a finite gradient at no starting point")
     results = [Local(to_box(best.normalised), best.f, best.violation) for best in successful]
     return Search(results, settings.sampled, measured)
+
+
+def _read_bounds(bounds: object) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lower and the upper bounds, (n,) each; raise TypeError if `bounds` is not a list of pairs."""
+    try:
+        box = np.asarray(bounds, dtype=float)
+    except (TypeError, ValueError):
+        box = np.zeros(0)
+    if box.shape != (box.size // 2, 2) or not box.size:
+        raise TypeError(f"bounds are {bounds!r}, but must be a list with a pair (lower, upper) for each element of x")
+    return box[:, 0], box[:, 1]
