@@ -25,7 +25,7 @@ from ptsmc_jax.numerics import elementary
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 
 Word = UInt32[Array, "..."]
-WholeNumber = int | np.integer | Array  # a negative number wraps to 32 bits
+WholeNumber = int | np.integer | Array  # a negative sample index, or a traced negative number, wraps to 32 bits
 
 
 class Key(NamedTuple):
@@ -35,9 +35,9 @@ class Key(NamedTuple):
     b: Array
 
 
-def _to_word(value: WholeNumber) -> Array:
-    """Return a seed, trial or sample as an unsigned 32-bit integer."""
-    check_fits("a seed, trial or sample", value)
+def _to_word(value: WholeNumber, least: int = -(2**31)) -> Array:
+    """Return a seed, trial or sample of at least `least` as an unsigned 32-bit integer."""
+    check_fits("a seed, trial or sample", value, least)
     if isinstance(value, int):
         return jnp.asarray(np.uint32(value & 0xFFFFFFFF), dtype=jnp.uint32)
     number = jnp.asarray(value)
@@ -48,7 +48,7 @@ def _to_word(value: WholeNumber) -> Array:
 
 def _to_scalar_word(value: WholeNumber) -> Array:
     """Return a seed or trial as a scalar word. An array is refused: its streams would be mixed sample by sample."""
-    word = _to_word(value)
+    word = _to_word(value, least=0)
     if word.ndim:
         raise ValueError(f"a seed or trial is of shape {word.shape}, but must be one number; use jax.vmap for several")
     return word
@@ -72,10 +72,16 @@ def check_whole_number(name: str, value: object, least: int = 0) -> None:
         raise ValueError(f"{name} is {value!r}, but must be a whole number from {least} to {2**32 - 1}")
 
 
-def check_fits(name: str, value: object) -> None:
-    """Raise ValueError if a concrete integer has more than 32 bits. Its stream would equal that of another integer."""
-    if isinstance(value, int | np.integer) and not -(2**31) <= value < 2**32:
-        raise ValueError(f"{name} is {value}, but must be a whole number below 2^32 = {2**32}")
+def check_fits(name: str, value: object, least: int = 0) -> None:
+    """Raise ValueError if a concrete integer is not in [`least`, 2^32). Its stream would equal that of another integer.
+
+    Args:
+        name: name of the value in the message.
+        value: any value; only concrete integers are checked.
+        least: smallest allowed integer.
+    """
+    if isinstance(value, int | np.integer) and not least <= value < 2**32:
+        raise ValueError(f"{name} is {value}, but must be a whole number from {least} to {2**32 - 1}")
 
 
 @jax.jit
@@ -118,7 +124,7 @@ def streams(seed: WholeNumber, trial: WholeNumber, names: Sequence[str]) -> list
         trial: number of the trial [-].
         names: names of the streams.
     """
-    seed, trial = _to_word(seed), _to_word(trial)
+    seed, trial = _to_word(seed, least=0), _to_word(trial, least=0)
     hashes = np.array([_hash_name(name) for name in names], np.uint32)
     keys = jax.lax.map(lambda name_hash: _stream_key(seed, trial, name_hash), hashes)
     return [Key(keys.a[k], keys.b[k]) for k in range(len(names))]
@@ -218,7 +224,7 @@ def draw_streams(
     Returns:
         The numbers (count,) [-], by the name of the stream.
     """
-    return _draw_streams(_to_word(seed), _to_word(trial), distribution, tuple(counts.items()))
+    return _draw_streams(_to_word(seed, least=0), _to_word(trial, least=0), distribution, tuple(counts.items()))
 
 
 @partial(jax.jit, static_argnames=("distribution", "counts"))

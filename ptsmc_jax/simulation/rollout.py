@@ -131,8 +131,8 @@ def simulate(
 
     Args:
         parts: parts of the run.
-        seed: whole number below 2^32 that selects the random numbers, together with `trial`.
-        trial: whole number below 2^32.
+        seed: whole number from 0 to 2^32 - 1 that selects the random numbers, together with `trial`.
+        trial: whole number from 0 to 2^32 - 1.
         record: whether to return the history.
         software: flight software of a sampled loop; by default the law and observer of `parts`.
 
