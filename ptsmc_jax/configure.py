@@ -73,7 +73,8 @@ def configure(
 ) -> None:
     """Set 64 bit numbers, one host device per core, compiler options and a persistent compile cache.
 
-    Call it before anything runs on JAX. A second call with the same arguments does nothing. If JAX was not imported
+    Call it before anything runs on JAX. A second call with the same arguments does nothing. A later call with other
+    `bits` is allowed: parts must then be built again, because existing arrays do not change. If JAX was not imported
     before, it also silences XLA's own messages ("Very slow compile?"), unless TF_CPP_MIN_LOG_LEVEL is set.
 
     Args:
@@ -90,7 +91,7 @@ def configure(
     Raises:
         ValueError: bits, device or devices is not allowed.
         NoDeviceError: there is no device of that kind.
-        RuntimeError: JAX has already run something with other options or devices.
+        RuntimeError: JAX has already run something with other compiler options or another number of devices.
     """
     if bits not in (32, 64):
         raise ValueError(f"bits is {bits!r}, but must be 32 or 64")
