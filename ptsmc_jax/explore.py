@@ -68,9 +68,6 @@ def html_list(lines: Iterable[object]) -> str:
 def write(scenario: Scenario, file: str | Path, *, force: bool = False) -> None:
     """Write a scenario to a TOML file with all keys, for the commands of `ptsmc`.
 
-    Objects that were made in Python, such as a custom law, are written by name only. A file with such a name cannot be
-    read: scenario files can refer only to code in files.
-
     Args:
         scenario: a scenario.
         file: path of the file.
@@ -78,11 +75,14 @@ def write(scenario: Scenario, file: str | Path, *, force: bool = False) -> None:
 
     Raises:
         RefusedError: the file exists and `force` is False, or it cannot be written.
+        ScenarioError: the scenario contains an object that was made in Python, such as the class of a custom law.
 
     >>> write(scenario.replace(scenario.from_tables({}), controller__eta=4.0), "mine.toml")  # doctest: +SKIP
     """
+    tables = parsing.dump(reading.to_scenario(scenario))
+    store.check_names_code(tables)
     store.check_file(Path(file), force, "force=True")
-    store.write_toml(Path(file), parsing.dump(reading.to_scenario(scenario)))
+    store.write_toml(Path(file), tables)
 
 
 @dataclass(frozen=True)

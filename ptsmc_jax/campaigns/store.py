@@ -22,6 +22,7 @@ import tomli_w
 
 from ptsmc_jax import provenance, units
 from ptsmc_jax.scenario import parsing
+from ptsmc_jax.scenario.errors import wrong
 
 try:
     import fcntl
@@ -481,3 +482,20 @@ def _name_objects(value: object) -> Any:
         return [_name_objects(v) for v in value]
     kind = value if isinstance(value, type) else type(value)
     return value if isinstance(value, bool | int | float | str) else f"<{kind.__name__} made in Python>"
+
+
+def check_names_code(tables: Tables) -> None:
+    """Raise ScenarioError if a value was made in Python, such as the class of a custom law."""
+    for key, value in _values_by_key(tables).items():
+        if not _is_plain(value):
+            allowed = 'the name of code in a file, such as "parts.py:Name", because a scenario file cannot contain code'
+            raise wrong(key, _name_objects(value), allowed)
+
+
+def _is_plain(value: object) -> bool:
+    """Return whether a value of a table consists of numbers and text only."""
+    if isinstance(value, Mapping):
+        value = list(value.values())
+    if isinstance(value, list | tuple):
+        return all(map(_is_plain, value))
+    return isinstance(value, bool | int | float | str)
