@@ -115,6 +115,23 @@ def test_profiles_and_gradient_check_handle_failed_trials():
     assert trust.gradient_error(evaluate, asked, bounds.normalise(np.array([0.7]))) == 0.0
 
 
+def test_correct_gradients_of_a_sharp_objective_agree_with_finite_differences():
+    """F is a sine with 700 periods between the bounds. An earlier step of 3e-4 had a truncation error of 12 %."""
+    bounds = Bounds(("k",), (0.0,), (1.0,))
+
+    def fly(problem: Any, normalised: np.ndarray) -> Measurement:
+        f = np.sin(4500.0 * normalised[:, 0])
+        return Measurement(normalised, f, np.zeros((len(f), 0, 1)), f)
+
+    def measure_with_gradients(problem: Any, normalised: np.ndarray) -> Any:
+        return SimpleNamespace(f_gradient=scale * 4500.0 * np.cos(4500.0 * normalised))
+
+    evaluate: Any = SimpleNamespace(bounds=bounds, measure=fly, measure_with_gradients=measure_with_gradients)
+    asked: Any = SimpleNamespace(names=bounds.names)
+    for scale, error in ((1.0, 0.0), (1.1, 0.1 / 1.1)):
+        np.testing.assert_allclose(trust.gradient_error(evaluate, asked, np.array([0.5])), error, atol=1e-4)
+
+
 def test_sensitivities_at_a_bound_use_points_inside_it(quiet):
     """The clock has no samples beyond the bound. One-sided differences in logarithms are accurate for powers."""
     for at in (0, 1):
@@ -158,7 +175,7 @@ def test_gradient_error_is_the_deviation_from_finite_differences():
             seen = super().measure_with_gradients(problem, normalised)
             return replace(seen, f_gradient=seen.f_gradient * np.array([1.0, 1.01, 1.0]))
 
-    behind = z + 3 * trust.DIFFERENCE_STEP * np.array([0.0, 1.0, 1.0])  # point of the gradients
+    behind = z + 3 * max(trust.DIFFERENCE_STEPS) * np.array([0.0, 1.0, 1.0])  # point of the gradients
     normalised = np.abs(evaluate.measure_with_gradients(noisy, behind[None]).f_gradient[0])
     expected = 0.01 * normalised[1] / (normalised * [1.0, 1.01, 1.0]).max()
     np.testing.assert_allclose(trust.gradient_error(Wrong(BOUNDS), noisy, z), expected, rtol=1e-3)

@@ -15,7 +15,7 @@ from tuning.search.evaluate import Evaluator
 from tuning.search.normalisation import TIMES, Bounds
 from tuning.search.objective import Problem
 
-DIFFERENCE_STEP = 3e-4  # step of the finite differences, in normalised gains
+DIFFERENCE_STEPS = (3e-4, 3e-5)  # steps of the finite differences, in normalised gains
 STEP = 1e-2  # step of the gains for `sensitivities`, relative to the gain
 SMALLEST_GRADIENT = 1e-6  # errors are relative to the gradient, or to this number if the gradient is smaller
 PROFILE_POINTS = 15  # number of values of a gain between its bounds, besides the final value
@@ -27,9 +27,11 @@ BOOTSTRAP_SAMPLES = 2000  # bootstrap samples of an interval
 def gradient_error(evaluate: Evaluator, problem: Problem, normalised: np.ndarray) -> float:
     """Return the largest relative error of the gradient of F, from automatic differentiation, at a point.
 
-    The reference are central finite differences of order 4 with steps of `DIFFERENCE_STEP`. The error is relative to
-    the largest element of the gradient. Near a bound, the point is moved just inside the bound. A time is moved past
-    its sample, because F has a kink if the hand-over lies on a sample: the first period of the anchored clock vanishes.
+    The reference are central finite differences of order 4. The result is the smaller error of two `DIFFERENCE_STEPS`:
+    the larger step has a truncation error if F has a sharp minimum, and the smaller step has a larger rounding error.
+    The error is relative to the largest element of the gradient. Near a bound, the point is moved just inside the
+    bound. A time is moved past its sample, because F has a kink if the hand-over lies on a sample: the first period of
+    the anchored clock vanishes.
 
     Args:
         evaluate: measures the problem.
@@ -39,16 +41,17 @@ def gradient_error(evaluate: Evaluator, problem: Problem, normalised: np.ndarray
     Returns:
         The relative error [-]. It is NaN if F has no gradient: no trial completes, or the objective is zero.
     """
-    shift = 3 * DIFFERENCE_STEP * np.isin(problem.names, TIMES)
-    count, inside = normalised.size, np.clip(normalised + shift, 2 * DIFFERENCE_STEP, 1.0 - 2 * DIFFERENCE_STEP)
-    offsets = np.concatenate([k * DIFFERENCE_STEP * np.eye(count) for k in (-2, -1, 1, 2)])
+    count, steps = normalised.size, np.asarray(DIFFERENCE_STEPS)
+    shift = 3 * steps.max() * np.isin(problem.names, TIMES)
+    inside = np.clip(normalised + shift, 2 * steps.max(), 1.0 - 2 * steps.max())
+    offsets = np.concatenate([k * step * np.eye(count) for step in steps for k in (-2, -1, 1, 2)])
     measured = evaluate.measure(problem, inside + offsets)
     if np.isnan(measured.objective).all():  # no trial has an objective, so F is a constant
         return np.nan
-    f = measured.f.reshape(4, count)
-    numeric = (f[0] - 8 * f[1] + 8 * f[2] - f[3]) / (12 * DIFFERENCE_STEP)
+    f = np.moveaxis(measured.f.reshape(steps.size, 4, count), 1, 0)
+    numeric = (f[0] - 8 * f[1] + 8 * f[2] - f[3]) / (12 * steps[:, None])
     exact = evaluate.measure_with_gradients(problem, inside[None]).f_gradient[0]
-    return float(np.abs(exact - numeric).max() / max(np.abs(exact).max(), SMALLEST_GRADIENT))
+    return float(np.abs(exact - numeric).max(axis=1).min() / max(np.abs(exact).max(), SMALLEST_GRADIENT))
 
 
 @dataclass(frozen=True)
