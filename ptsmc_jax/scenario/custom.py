@@ -174,7 +174,7 @@ def _add_class_keys(table: Any, custom_class: type) -> Any:
             try:
                 dataclasses.dataclass(frozen=True)(cls)
             except TypeError as error:  # for example a field without a default
-                allowed = "fields with a default, whose names the base class does not use"
+                allowed = "fields with a type annotation and a default, whose names the base class does not use"
                 raise ValueError(
                     f"the class {cls.__name__} cannot have such fields: {error}; allowed are {allowed}"
                 ) from None
@@ -261,6 +261,13 @@ def _declaration(table: Any, custom_class: type, field: dataclasses.Field) -> De
                 f"the usual bounds of the gain {field.name} of the class {custom_class.__name__} are "
                 f"{show(declared.usual)}, but must be two numbers, a function of t_f and the control period, or one of "
                 f"{', '.join(map(show, SHARED_BOUNDS))}"
+            )
+        number, usual = typing.cast(Any, value), typing.cast(Any, declared.usual)
+        is_interval = isinstance(usual, tuple) and len(usual) == 2 and all(map(_is_number, usual))
+        if is_interval and usual[0] < usual[1] and not usual[0] <= number <= usual[1]:
+            low, high = usual
+            raise ValueError(
+                f"the default of {field.name} is {number:g}, but must be inside its usual bounds, {low:g} to {high:g}"
             )
     return declared
 

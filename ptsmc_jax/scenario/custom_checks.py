@@ -68,7 +68,7 @@ class _Checker:
 
     def __init__(self, name: str, table: Any):
         shown = brief(table.code) if isinstance(table.code, str) else table.part_class.__name__
-        self._beginning, self._made = f"{name}.code is {shown}, but its", table.part_class
+        self._beginning, self._made = f"{name}.code is {shown}, whose", table.part_class
 
     def __call__(self, method: str, function: Callable, *args: object) -> Any:
         """Return the value of a method of the custom class, after it has also been traced.
@@ -231,10 +231,16 @@ def _check_law(parts: Parts, call: _Checker) -> None:
     has_memory = memory is not None
     if type(law).__call__ is not Law.__call__:
         method, function, arguments, has_memory = "__call__", law.__call__, (now, x, target, u, k2), True
-    returned = call(method, function, *arguments)
-    allowed = f"an {'acceleration' if method == 'acceleration' else 'input'}, a sliding variable"
+    try:
+        returned = call(method, function, *arguments)
+    except ScenarioError as error:
+        if memory is None and "NoneType" in str(error):
+            raise ScenarioError(f"{error}; a law that uses now.memory needs a method begin") from None
+        raise
+    first = f"an {'acceleration' if method == 'acceleration' else 'input'}"
     example = (u, u, memory) if has_memory else (u, u)
-    call.check(method, f"{allowed}, its memory" if has_memory else allowed, returned, example)
+    allowed = f"{first}, a sliding variable and its memory" if has_memory else f"{first} and a sliding variable"
+    call.check(method, allowed, returned, example)
     call.check_finite(method, returned[:2])
     call.check(method, "a memory as begin does", returned[2:], example[2:], exact=True)
 

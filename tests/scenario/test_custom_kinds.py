@@ -317,8 +317,8 @@ RETURNS = "return 0.5 * wanted"
 CHANGED = [
     (f"{RETURNS}, s", "return jnp.zeros(2), s", "acceleration returns (real(2,), real(1,))", "(real(1,), real(1,))"),
     (f"{RETURNS}, s", "return [0.5 * wanted[0]], s", "returns ([real()], real(1,))", "form (real(1,), real(1,))"),
-    (f"{RETURNS}, s", "return [0.5 * wanted, s]", "returns [real(1,), real(1,)]", "an acceleration, a sliding"),
-    (f"{RETURNS}, s", RETURNS, "returns real(1,)", "an acceleration, a sliding variable"),
+    (f"{RETURNS}, s", "return [0.5 * wanted, s]", "returns [real(1,), real(1,)]", "an acceleration and a sliding"),
+    (f"{RETURNS}, s", RETURNS, "returns real(1,)", "an acceleration and a sliding variable"),
     (f"{RETURNS}, s", "0.5 * wanted, s", "acceleration returns nothing", "a sliding variable"),
     # an earlier version ran this as 0 and 1, and margins ended in a traceback
     (f"{RETURNS}, s", f"{RETURNS}, s > 0.0", "returns (real(1,), bool(1,))", "of the form (real(1,), real(1,))"),
@@ -326,13 +326,16 @@ CHANGED = [
     (RETURNS, "return self.width_ * wanted", "AttributeError: 'Mine' object has no attribute 'width_'", "line 21 of"),
     ("def acceleration", "def accelerate", "the class Mine has no method", "acceleration or __call__"),
     (f"{RETURNS}, s", "return 1 / 0 * wanted, s", "acceleration fails", "line 21 of mine.py"),
+    (f"{RETURNS}, s", f"{RETURNS}, s, now.memory + error", "NoneType", "needs a method begin"),
+    ("gain(3.0,", "gain(7.0,", "the default of eta is 7", "inside its usual bounds, 2.1 to 6"),
+    ("    width: float", "    k_i = ptsmc.gain(0.1, (0.01, 1.0))\n    width: float", "cannot have", "type annotation"),
     (RETURNS, "exit(0)", "acceleration fails: SystemExit", "line 21 of mine.py"),
     (RETURNS, "return jnp.log(-1.0) * wanted", "returns [nan]", "finite numbers"),
     (RETURNS, "return wanted if wanted[0] > 9.0 else 0.5 * wanted", "needs the value of a traced number",
      "jax.numpy.where instead of if"),
     (RETURNS, "return float(wanted[0]) * wanted", "needs the value", "jax.numpy instead of numpy and float()"),
     ("        left =", "        kept.append(error)\n        error = kept[-2:][0]\n        left =",
-     "its acceleration stores a traced number", "memory"),
+     "whose acceleration stores a traced number", "memory"),
     ("3.0, (2.1, 6.0), above=2.0", "3.0", "the gain eta of the class Mine has no bounds", "usual=(lower, upper)"),
     ("(2.1, 6.0)", "(6.0, 2.1)", "usual bounds of the gain eta of the class Mine are [6, 2.1]", "lower one first"),
     # an earlier error named tune.bounds.eta, which is not in the file
@@ -365,7 +368,7 @@ BAD = [
     (LAW, {"code": "gone.py:Mine"}, "the file gone.py does not exist", "gone.py"),
     (LAW, {"code": "mine"}, 'controller.code is "mine"', "FILE.py:NAME"),
     (LAW, {"code": None}, "controller.code is absent", "FILE.py:NAME"),
-    (REMEMBERS, {}, "acceleration returns (real(1,), real(1,))", "a sliding variable, its memory"),
+    (REMEMBERS, {}, "acceleration returns (real(1,), real(1,))", "an acceleration, a sliding variable and its memory"),
     (REMEMBERS.replace("wanted, s", "wanted, s, jnp.zeros(2)"), {}, "returns (real(1,), real(1,), real(2,))", "1,))"),
 ]
 # fmt: on
