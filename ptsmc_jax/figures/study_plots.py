@@ -324,16 +324,18 @@ def costs(
         if not k:
             low, high = error_display(kind)[0]([point.interval or (point.rms, point.rms) for point in points]).T
             axes.fill_between(sweep.values, low, high, color=STYLES[0][0], alpha=0.2, lw=0)
-            axes.legend(fontsize=8)
         known = values[np.isfinite(values)]
         if known.size and np.all(known > 0.0):
             logarithmic(axes, "y")
         if limit is not None:
-            axes.axhline(limit, **LIMIT)
+            axes.axhline(limit, **LIMIT, label="limit of the scenario")
         if sweep.ticks is not None:
             axes.set_xticks(sweep.values, sweep.ticks)
         axes.set_title(title, fontsize=10, loc="center")
         axes.set_xlabel(sweep.label, fontsize=10)
+    legends = [axes.get_legend_handles_labels() for axes in figure.axes]
+    by_label = {label: handle for pair in legends for handle, label in zip(*pair, strict=True)}
+    figure.legend(by_label.values(), by_label.keys(), loc="outside lower left", ncols=3, fontsize=9, frameon=False)
     return figure
 
 

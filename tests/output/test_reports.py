@@ -317,7 +317,8 @@ def robust(limit: float, rms: float, **margins: float) -> Point:
 
 def slew(t_f: float, rms: float, peak: float, **changes: Any) -> Point:
     """Return a point of a Pareto front over the slew time t_f [s]; peak: torque [N m]."""
-    return Point(t_f, {"eta": 3.0}, rms, (0.9 * rms, 1.1 * rms), {"peak_torque": peak}, **changes)
+    costs = {"peak_torque": peak, "ape_boresight": 30 * rms, "gain_margin": 6.2}
+    return Point(t_f, {"eta": 3.0}, rms, (0.9 * rms, 1.1 * rms), costs, **changes)
 
 
 NO_TRIAL = torque(0.1, math.nan, math.nan, failures=9)
@@ -345,7 +346,7 @@ FRONTS: dict[str, Callable[[], Front]] = {
     "no gains for any limit": lambda: front(against="margins", without=[math.inf, 6.0], requirements=["effort"]),
     "front over the slew time": lambda: front(
         slew(8.0, 1e-5, 0.2, failures=2), slew(16.0, 4e-6, 0.05, meets=True), against="t_f", without=[4.0],
-        requirements=["peak_torque"],
+        requirements=["peak_torque", "ape_boresight", "gain_margin"],
     ),
     "no slew": lambda: front(against="t_f"),
     "a lower bound of zero": lambda: front(torque(0.2, 0.2, 1e-5), lower_bound=0.0),

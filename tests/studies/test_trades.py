@@ -127,11 +127,6 @@ WORST_CASE = {"tune": {"worst_case": True}}
         (slew_time, {"tune": {"free": ["eta", "t_f"]}}, "but must be without t_f for a front against t_f"),
         (slew_time, FASTEST, 'tune.minimise is "t_f"'),
         (slew_time, WORST_CASE, "tune.worst_case is true, but must be false"),
-        (
-            slew_time,
-            {"requirements": {"gain_margin": 6.0}, "tune": {}},
-            "requirements.gain_margin must be absent for a front against t_f",
-        ),
         (  # t_o would stay a third of the scenario's t_f at every time
             slew_time,
             {"observer": {"kind": "prescribed_time"}, "tune": {}},
@@ -170,7 +165,7 @@ def test_margins_of_a_front_are_those_of_the_loops_if_a_trial_fails():
     tables = {name: table for name, table in tomllib.loads(SHORT_CHAIN).items() if name != "dispersion"}
     made, status = scenario.from_tables(tables), np.array([0, rollout.DIVERGED])
     trials = Trials(np.arange(2), Metrics(dict.fromkeys(METRICS, np.ones(2))), status, np.zeros(2), {})
-    costs = trades.Margins(made).costs(made, trials, 0)
+    costs = trades.Margins(made).costs(made, trials, [], 0)
     assert min(costs[name] for name in MARGINS) > 0.0
 
 
@@ -216,6 +211,31 @@ def test_pareto_against_t_f_finds_gains_for_each_time_and_faster_slews_need_more
     assert "from an earlier run" in again[1]
 
 
+def test_front_against_t_f_keeps_the_required_margins_of_the_loop_with_each_t_f(monkeypatch):
+    """All gains break the required margin at t_f = 5 s. At 3 s some gains keep it, but not the most accurate ones."""
+    small_search(monkeypatch, 40)
+    tables = tomllib.loads(re.sub(r"\[dispersion\]\n.*\n", "", SHORT_CHAIN))  # one loop
+    known = scenario.from_tables({**tables, "requirements": {"peak_torque": 20.0, "phase_margin": 52.0}})
+    trade = trades.SlewTime(known, (3.0, 5.0))
+    traced = pareto.trace(trade, 0)
+    assert traced.without == [5.0]
+    (point,) = traced.points
+    assert point.meets
+
+    def phase_margin(t_f, found):
+        tuned = judging.on_flight_clock(trade.tuned_scenario(t_f, found))
+        by_place = stability.worst_margins(scenario.study(tuned)) or {}
+        return min(place["phase_margin"] for place in by_place.values())
+
+    np.testing.assert_allclose(point.costs["phase_margin"], phase_margin(3.0, point.gains), rtol=1e-6)
+    assert point.costs["phase_margin"] >= 52.0 > phase_margin(5.0, point.gains)
+    most_accurate = {"eta": 3.05, "delta": 0.1}
+    assert phase_margin(3.0, most_accurate) < 52.0
+    figure = pareto.figure_of(trade, traced)
+    assert "phase margin [deg]" in [axes.get_title() for axes in figure.axes]
+    assert "limit of the scenario" in [text.get_text() for text in figure.legends[0].get_texts()]
+
+
 def test_every_prescribed_time_has_its_own_search(monkeypatch):
     """Other times may have other local minima. All times use the difficult trials of the first two times."""
     small_search(monkeypatch, 8)
@@ -254,17 +274,20 @@ def test_identity_of_a_study_has_all_digits_of_its_times():
     assert listed == ["20,100.0001", "20,100.0002", "20,30"]
 
 
-def test_costs_in_a_front_against_t_f_are_metrics_that_the_scenario_has():
+def test_costs_in_a_front_against_t_f_are_metrics_that_the_scenario_has_or_requires():
     trials = Trials(np.arange(1), Metrics(dict.fromkeys(METRICS, np.ones(1))), np.zeros(1, int), np.zeros(1), {})
 
     def costs(**tables):
         made = scenario.from_tables(tables)
-        return list(trades.SlewTime(made).costs(made, trials, 0))
+        verdicts = judging.verdicts_of(made, trials, 0)
+        return list(trades.SlewTime(made).costs(made, trials, verdicts, 0))
 
     assert costs() == ["peak_torque", "peak_momentum", "peak_rate", "effort"]
     assert set(trades.SLEW_COSTS) == set(costs(loop={"mode": "sampled"}, wheels={}))
     assert costs(plant={"kind": "chain"}) == ["peak_torque", "peak_rate", "effort"]
     assert set(trades.SLEW_COSTS) <= set(catalogues.CATALOGUES["spacecraft"])
+    required = {"peak_rate": 1.0, "window_error": 1.0, "hold_angle": 1.0}  # the error has a column of its own
+    assert costs(requirements=required) == ["peak_torque", "peak_momentum", "peak_rate", "effort", "hold_angle"]
 
 
 def test_default_bounds_of_delta_follow_the_shortest_t_f_of_a_front():

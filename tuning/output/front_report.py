@@ -3,8 +3,17 @@
 import math
 from collections.abc import Iterator, Sequence
 
+from ptsmc_jax.simulation.catalogues import MARGINS
 from tuning.output import margins_report
-from tuning.output.formats import format_count, format_error, format_metric, format_number, format_ratio, ratio_to_bound
+from tuning.output.formats import (
+    format_count,
+    format_error,
+    format_metric,
+    format_number,
+    format_ratio,
+    in_readable_unit,
+    ratio_to_bound,
+)
 from tuning.output.report import Report, Section, Table, Text, warning_lines
 from tuning.studies.front import KINDS, Front, Point, metric_heading, unit_of
 
@@ -35,17 +44,23 @@ def result_table(front: Front) -> Table:
     rows, plant = _labelled_points(front), front.plant
     costs = list(rows[0][1].costs) if rows else []
     bound_heading = ["times the lower bound"] if front.lower_bound else []
-    heads = [metric_heading(name, plant) for name in costs]
+    columns = {
+        name: in_readable_unit(name, unit_of(name, plant), *(point.costs[name] for _, point in rows)) for name in costs
+    }
+    heads = [metric_heading(name, unit) for name, (unit, _) in columns.items()]
     cells = [
         (
             label,
             format_error(point.rms, plant),
             relative_spread(point),
             *(format_ratio(ratio_to_bound(point.rms, front.lower_bound)) for _ in bound_heading),
-            *(format_number(point.costs[name], ".4g", _describe_no_value(name, point)) for name in costs),
+            *(
+                format_number(values[row], ".4g", _describe_no_value(name, point))
+                for name, (_, values) in columns.items()
+            ),
             _describe_marks(point),
         )
-        for label, point in rows
+        for row, (label, point) in enumerate(rows)
     ]
     return Table((KINDS[front.against].label(plant), "RMS error", "+-", *bound_heading, *heads, ""), cells)
 
@@ -143,11 +158,11 @@ def _margin_results(front: Front) -> Iterator[str]:
 
 
 def _time_results(front: Front) -> Iterator[str]:
-    """Return lines on the shortest time that meets every requirement, and on the cost of the fastest slew."""
+    """Return lines on the shortest tuned time that meets every requirement, and on the cost of the fastest slew."""
     shortest = min((point for point in front.points if point.meets), key=lambda point: point.value, default=None)
     if shortest is not None and front.requirements:
         rms = format_error(shortest.rms, front.plant)
-        yield f"RMS error {rms} at t_f = {shortest.value:g} s, the shortest time that meets every requirement"
+        yield f"RMS error {rms} at t_f = {shortest.value:g} s, the shortest in the list that meets every requirement"
     if len(front.points) < 2:
         return
     fastest, slowest = front.points[0], front.points[-1]
@@ -156,10 +171,10 @@ def _time_results(front: Front) -> Iterator[str]:
         error_ratio = format_ratio(fastest.rms / slowest.rms)
         yield f"RMS error {format_error(fastest.rms, front.plant)} {at_fastest}, {error_ratio} {than_slowest}"
     for name, cost in fastest.costs.items():
-        if cost > 0.0 and slowest.costs[name] > 0.0:
-            unit = unit_of(name, front.plant)
+        if name not in MARGINS and cost > 0.0 and slowest.costs[name] > 0.0:
             cost_ratio = cost / slowest.costs[name]
-            yield f"{name.replace('_', ' ')} {cost:.4g} {unit} {at_fastest}, {cost_ratio:.3g} {than_slowest}"
+            value = format_metric(cost, name, front.plant)
+            yield f"{name.replace('_', ' ')} {value} {at_fastest}, {cost_ratio:.3g} {than_slowest}"
 
 
 def _keeps_limit(point: Point) -> bool:

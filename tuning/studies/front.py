@@ -41,11 +41,15 @@ def unit_of(name: str, plant: str) -> str:
     return {**MARGINS, **CATALOGUES[plant]}[name.removeprefix("mean_")].unit
 
 
-def metric_heading(name: str, plant: str) -> str:
-    """Return the heading of a metric or margin over trials, with its unit for this kind of plant.
+def metric_heading(name: str, unit: str) -> str:
+    """Return the heading of a metric or margin over trials, with the unit of the column.
 
-    >>> [metric_heading(name, "chain") for name in ("peak_torque", "delay_margin", "peak_sensitivity")]
-    ['largest peak torque [u]', 'delay margin [s]', 'largest |S| [dB]']
+    >>> (
+    ...     metric_heading("peak_torque", "u"),
+    ...     metric_heading("delay_margin", "s"),
+    ...     metric_heading("peak_sensitivity", "dB"),
+    ... )
+    ('largest peak torque [u]', 'delay margin [s]', 'largest |S| [dB]')
     """
     words = name.replace("_", " ")
     if name == "peak_sensitivity":
@@ -54,7 +58,7 @@ def metric_heading(name: str, plant: str) -> str:
         words = f"RMS {words}"
     elif name not in MARGINS and not name.startswith("mean_"):
         words = f"largest {words}"
-    return f"{words} [{unit_of(name, plant)}]"
+    return f"{words} [{unit}]"
 
 
 @dataclass(frozen=True)

@@ -111,7 +111,11 @@ def rms_lower_bound(scenario: Scenario, held_out_seed: int) -> float | None:
 
 
 def verdicts_of(
-    scenario: Scenario, trials: Trials, held_out_seed: int, problem: Problem | None = None
+    scenario: Scenario,
+    trials: Trials,
+    held_out_seed: int,
+    problem: Problem | None = None,
+    reach: Reach | None = None,
 ) -> list[Verdict]:
     """Return the verdicts on the requirements, and on the required margins of the loop.
 
@@ -120,8 +124,9 @@ def verdicts_of(
         trials: the held-out trials of these gains.
         held_out_seed: seed of these trials.
         problem: the tuning problem of the search, see `judge`.
+        reach: ranges of the gains that share a compiled program, see `judge`.
     """
-    ready = _on_flight_clock(scenario, problem)
+    ready = _on_flight_clock(scenario, problem, reach)
     # one nominal trial is judged as a number, because a required fraction of the trials has no meaning for it
     selection = 0 if trials.status.size == 1 else slice(None)
 

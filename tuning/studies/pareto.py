@@ -16,6 +16,7 @@ from ptsmc_jax.figures import study_plots, style
 from ptsmc_jax.scenario import parsing, plausibility, study, tables
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.timing import Reach
+from ptsmc_jax.simulation.catalogues import MARGINS
 from tuning.search import gains, trust
 from tuning.search.evolution import NEAR_BEST
 from tuning.search.journal import Journal
@@ -96,8 +97,8 @@ def _judge_point(
     """Return a point with its results on the held-out trials of this seed, and these trials."""
     trials = judging.judge(tuned, seed, problem, reach)
     rms, interval = judging.rms_window_error(trials)
-    met = judging.meets_requirements(judging.verdicts_of(tuned, trials, seed, problem), trials)
-    costs = trade.costs(tuned, trials, seed)
+    verdicts = judging.verdicts_of(tuned, trials, seed, problem, reach)
+    met, costs = judging.meets_requirements(verdicts, trials), trade.costs(tuned, trials, verdicts, seed)
     results = {"rms": np.nan if rms is None else rms, "interval": interval, "failures": int(np.sum(~trials.ok))}
     return replace(point, costs=costs, meets=met, **results), trials
 
@@ -222,17 +223,15 @@ def figure_of(trade: Trade, front: Front) -> Figure:
     to_shown_unit, error, unit = style.error_display(front.plant)
     limit = tables.limit_of(scenario, "window_error")
     rms = to_shown_unit([point.rms for point in front.points])
-    panels = {f"RMS {error} in the window [{unit}]": (rms, None if limit is None else float(to_shown_unit(limit)))} | {
-        metric_heading(name, front.plant): (
-            np.array([point.costs[name] for point in front.points]),
-            tables.limit_of(scenario, name),
-        )
-        for name in front.points[0].costs
-        if name != SENSITIVITY
-    }
-    panels = {
-        title: (np.where(np.isfinite(column), column, np.nan), limit) for title, (column, limit) in panels.items()
-    }
+    panels = {f"RMS {error} in the window [{unit}]": (rms, None if limit is None else float(to_shown_unit(limit)))}
+    for name in front.points[0].costs:
+        if (front.against, name) == ("margins", SENSITIVITY):  # the horizontal axis
+            continue
+        is_margin = name in MARGINS
+        convert, unit = (np.asarray, MARGINS[name].unit) if is_margin else style.metric_display(name, front.plant)
+        column, limit = convert([point.costs[name] for point in front.points]), tables.limit_of(scenario, name)
+        shown_limit = None if limit is None else float(convert(limit))
+        panels[metric_heading(name, unit)] = (np.where(np.isfinite(column), column, np.nan), shown_limit)
     values = [point.value for point in front.points]
     finite = [value for value in values if np.isfinite(value)]
     # the point without a limit is as far from the loosest limit as the next limit

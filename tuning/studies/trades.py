@@ -18,7 +18,9 @@ from ptsmc_jax.scenario import custom, free_gains, parsing, study, tables
 from ptsmc_jax.scenario.errors import ScenarioError, wrong
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation.catalogues import MARGINS
+from ptsmc_jax.simulation.requirements import Verdict
 from tuning.search import gains
+from tuning.search.margin_rows import RequiredMargins
 from tuning.search.objective import T_F, Problem, replace_entries
 from tuning.search.optimise import Search
 from tuning.search.progress import Report, headed
@@ -96,12 +98,13 @@ class Trade(ABC):
         return gains.in_scenario(self.scenario, found)
 
     @abstractmethod
-    def costs(self, tuned: Scenario, trials: Trials, seed: int) -> dict[str, float]:
+    def costs(self, tuned: Scenario, trials: Trials, verdicts: Sequence[Verdict], seed: int) -> dict[str, float]:
         """Return the costs of gains by name, in the units of the metrics and margins.
 
         Args:
             tuned: the scenario with the gains.
             trials: the held-out trials of the gains.
+            verdicts: verdicts on the requirements and the required margins.
             seed: seed of these trials.
         """
 
@@ -172,7 +175,7 @@ class Torque(Trade):
             normalised for outcome in (unlimited, least, middle) for normalised in (outcome.normalised, *outcome.ends)
         ]
 
-    def costs(self, tuned: Scenario, trials: Trials, seed: int) -> dict[str, float]:
+    def costs(self, tuned: Scenario, trials: Trials, verdicts: Sequence[Verdict], seed: int) -> dict[str, float]:
         """Return the largest and the mean peak torque [N m]."""
         peaks = np.asarray(trials.metrics.peak_torque)[trials.finished]
         mean = float(np.mean(peaks)) if peaks.size else np.nan
@@ -229,14 +232,14 @@ class Margins(Trade):
             known.append(outcome.normalised)
         return targets, known
 
-    def costs(self, tuned: Scenario, trials: Trials, seed: int) -> dict[str, float]:
+    def costs(self, tuned: Scenario, trials: Trials, verdicts: Sequence[Verdict], seed: int) -> dict[str, float]:
         """Return the largest peak torque [N m], and the worst margins of the held-out trials' loops.
 
         Loops of trials that fail count, too: a margin without a value would look like an unlimited one.
         """
         with_margins = scenarios.replace(tuned, requirements=dict.fromkeys(MARGINS, 1.0))
-        verdicts = margin_verdicts.judge_trials(study(judging.on_flight_clock(with_margins)), seed)
-        return {TORQUE: judging.required_quantile(TORQUE, tuned, trials)} | {v.metric: v.worst for v in verdicts}
+        by_margin = margin_verdicts.judge_trials(study(judging.on_flight_clock(with_margins)), seed)
+        return {TORQUE: judging.required_quantile(TORQUE, tuned, trials)} | {v.metric: v.worst for v in by_margin}
 
     def options(self) -> dict[str, object]:
         """Return the options --against and --limits of `ptsmc pareto`, by name."""
@@ -263,9 +266,6 @@ class SlewTime(Trade):
             raise wrong("tune.free", list(scenario.search.gains), f"without t_f {self.purpose}")
         if free_gains.is_observer_time_default(scenario):
             raise ScenarioError(f"observer.t_o is absent, but must be set {self.purpose}; its default depends on t_f")
-        for key in scenario.requirements:
-            if key in MARGINS:
-                raise ScenarioError(f"requirements.{key} must be absent {self.purpose}, which does not compute margins")
         for t_f in self.values:
             self._with_t_f(t_f)
 
@@ -297,29 +297,42 @@ class SlewTime(Trade):
     def targets(self, setup: TuningSetup, report: Report) -> tuple[list[Target], list[np.ndarray]]:
         """Search for the best gains at the longest time, the shortest, and the others; see `Trade.targets`.
 
-        Hard trials that the first two searches add to the training trials are used for all other times, too.
+        Hard trials that the first two searches add to the training trials are used for all other times, too. Required
+        margins are margins of the loop with the same t_f, and each time selects its own loops among the trials.
         """
         problem, last, known = setup.problem, len(self.values) - 1, []
-        parts = [gains.with_gains(problem.parts, {"t_f": t_f}) for t_f in self.values]
+        margins = dict[int, RequiredMargins | None]()
         for k in (last, 0, *range(last - 1, 0, -1)):
-            name = {last: "longest time", 0: "shortest time"}.get(k, f"{self.values[k]:g} s")
             starts, constraints = None if k == last else FEWER_STARTS, None if k in (0, last) else ()
-            outcome = _search(setup, replace(problem, parts=parts[k]), headed(report, name), starts, constraints)
+            time_report = headed(report, self._name(self.values[k]))
+            outcome = _search(setup, _at_time(problem, self.values[k]), time_report, starts, constraints)
             known.append(outcome.normalised)
+            margins[k] = outcome.problem.margins
             problem = outcome.problem if k in (0, last) else problem
-        problems = [replace(problem, parts=variant) for variant in parts]
-        targets = [Target(t_f, f"{t_f:g} s", variant) for t_f, variant in zip(self.values, problems, strict=True)]
+        targets = [
+            Target(t_f, self._name(t_f), replace(_at_time(problem, t_f), margins=margins[k]))
+            for k, t_f in enumerate(self.values)
+        ]
         return targets, known
+
+    def _name(self, t_f: float) -> str:
+        """Return the name of a prescribed time in progress reports."""
+        return f"t_f = {t_f:g} s"
 
     def tuned_scenario(self, value: float, found: dict[str, float]) -> Scenario:
         """Return the scenario with this prescribed time [s] and these gains."""
         return gains.in_scenario(self._with_t_f(value), found)
 
-    def costs(self, tuned: Scenario, trials: Trials, seed: int) -> dict[str, float]:
-        """Return `judging.required_quantile` of the metrics in `SLEW_COSTS` that runs of the scenario have."""
+    def costs(self, tuned: Scenario, trials: Trials, verdicts: Sequence[Verdict], seed: int) -> dict[str, float]:
+        """Return the metrics in `SLEW_COSTS` that runs of the scenario have, other required metrics and margins.
+
+        A metric is its `judging.required_quantile`, and a margin is its worst value.
+        """
         needed = {name: tuned.metrics[name].table for name in SLEW_COSTS if name in tuned.metrics}
         has = [name for name, table in needed.items() if table is None or getattr(tuned, table, None) is not None]
-        return {name: judging.required_quantile(name, tuned, trials) for name in has}
+        metrics = dict.fromkeys([*has, *(v.metric for v in verdicts if v.metric not in (*MARGINS, "window_error"))])
+        margins = {v.metric: v.worst for v in verdicts if v.metric in MARGINS}
+        return {name: judging.required_quantile(name, tuned, trials) for name in metrics} | margins
 
     def options(self) -> dict[str, object]:
         """Return the options --against and --times of `ptsmc pareto`, by name."""
@@ -365,6 +378,12 @@ def limits_between(lowest: float, highest: float, points: int, scenario_limit: f
         middle = 1 + int(np.argmin(np.abs(np.log(limits[1:-1] / scenario_limit))))
         limits[middle] = scenario_limit
     return limits, middle
+
+
+def _at_time(problem: Problem, t_f: float) -> Problem:
+    """Return the problem with this prescribed time [s], in its simulations and in the loops of its margins."""
+    parts, margins = gains.with_gains(problem.parts, {"t_f": t_f}), problem.margins
+    return replace(problem, parts=parts, margins=None if margins is None else replace(margins, parts=parts))
 
 
 def least_torque(
