@@ -123,12 +123,13 @@ def test_correct_gradients_of_a_sharp_objective_agree_with_finite_differences():
         f = np.sin(4500.0 * normalised[:, 0])
         return Measurement(normalised, f, np.zeros((len(f), 0, 1)), f)
 
-    def measure_with_gradients(problem: Any, normalised: np.ndarray) -> Any:
-        return SimpleNamespace(f_gradient=scale * 4500.0 * np.cos(4500.0 * normalised))
-
-    evaluate: Any = SimpleNamespace(bounds=bounds, measure=fly, measure_with_gradients=measure_with_gradients)
     asked: Any = SimpleNamespace(names=bounds.names)
     for scale, error in ((1.0, 0.0), (1.1, 0.1 / 1.1)):
+
+        def measure_with_gradients(problem: Any, normalised: np.ndarray, scale: float = scale) -> Any:
+            return SimpleNamespace(f_gradient=scale * 4500.0 * np.cos(4500.0 * normalised))
+
+        evaluate: Any = SimpleNamespace(bounds=bounds, measure=fly, measure_with_gradients=measure_with_gradients)
         np.testing.assert_allclose(trust.gradient_error(evaluate, asked, np.array([0.5])), error, atol=1e-4)
 
 
