@@ -83,9 +83,10 @@ STATUS_TABLE
 | `met` | - | whether the requirement is met |
 | `reason` | - | why a margin has no value; else empty |
 
-The requirement is met if `margin` is at most 1. A `margin` of 1.1 is 10 % beyond the limit. With a quantile, `margin`
-uses the value at the quantile instead of `worst`. For a fraction of the time, `margin` is the fraction beyond
-the limit, divided by the allowed fraction. It is null if a failed trial counts, or if the trials are too few."""
+`margin` is a ratio and no stability margin. The requirement is met if it is at most 1. With 1.1 the worst value is 10 %
+beyond the limit. With a quantile, `margin` uses the value at the quantile instead of `worst`. For a fraction of the
+time, `margin` is the fraction beyond the limit, divided by the allowed fraction. It is null if a failed trial counts,
+or if the trials are too few."""
 ERRORS = """\
 With `controller.error = "additive"` the attitude error vector is eps_1 = q_1 - q_1f, as in the paper. With
 `"multiplicative"`, and for the comparison laws, it is the vector part of q_f* q. The units x1, x2 and u are those of

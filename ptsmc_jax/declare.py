@@ -139,17 +139,17 @@ def gain(
     A gain is searched on a log scale if its bounds are positive and more than a factor of 10 apart.
 
     Args:
-        default: as for `number`.
+        default: its value if the file gives none: a number, numbers, a `Scaled`, or None if it follows from other keys.
         usual: bounds of a search if a scenario gives none: two numbers, a function of t_f and the control period [s],
             or the name of bounds in `scenario.gain_bounds`.
         above: the gain is greater than this.
         below: it is less than this.
         at_least: it is not less than this.
         at_most: it is not greater than this.
-        unit: as for `number`.
+        unit: unit of the gain; two units: of a spacecraft, and of a plant without a body.
         meaning: meaning of the number.
         each: there is one number for each input of the plant; tuning moves them together, or each alone.
-        allowed: as for `number`.
+        allowed: the allowed values in words; by default they are made from the limits.
         free: whether tuning moves it by default; "sampled": in the sampled loop only.
     """
     limits = Limits(-math.inf if math.isfinite(at_least) else above, at_least, below, at_most)
