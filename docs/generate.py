@@ -25,11 +25,12 @@ MADE = "<!-- Made by docs/generate.py from the code, where it is to be changed. 
 LISTS = ("three numbers", "a list of numbers")  # allowed values of a key that has a number for each component
 PLANTS = {"spacecraft": "A spacecraft", "chain": "An integrator chain", "system": "A custom system"}
 SCENARIOS = """\
-A scenario is a TOML file of tables. Every table and every key is optional, and has a default. Defaults with * are
-those of the paper's case. For any other body or t_f they [follow the mission](theory/default_gains.md), and gains are
-designed for the sampled loop. `orbit`, `flexible`, `hardware`, `sensors`, `wheels`, `filter`, `pointing`,
-`dispersion`, `requirements` and `tune` are off if they are absent. A key that is unknown, has the wrong type, is out of
-range or is not finite is refused with its name. `ptsmc new` writes a file with all of this.
+A scenario is a TOML file of tables. Every table and every key is optional, and has a default. Defaults with * apply
+only with the inertia and t_f of the paper. For any other spacecraft or t_f they [follow from the
+mission](theory/default_gains.md), and gains are designed for the sampled loop. `orbit`, `flexible`, `hardware`,
+`sensors`, `wheels`, `filter`, `pointing`, `dispersion`, `requirements` and `tune` are off if they are absent. A key
+that is unknown, has the wrong type, is out of range or is not finite is refused with its name. `ptsmc new` writes a
+file with all of this.
 
 Numbers are in the unit of their key. A text such as `"10 arcsec"` has a unit of its own. In a list each number may have
 its own, such as `["350 kg cm^2", "300 kg cm^2", 0.03]`:

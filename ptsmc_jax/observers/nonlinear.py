@@ -24,8 +24,8 @@ class NonlinearObserver(Observer):
 
     gain: Leaf = declare.gain(  # (m,), so that l J^-1 is in 1/s
         None, "dead_beat", each=True, unit=("N m s", "1/s"),
-        meaning="diagonal of l(w), or of its constant part; 10 in the paper; default for the sampled "
-                "loop: at most half as fast as the hold phase",
+        meaning="diagonal of l(w), or of its constant part; 10 N m s in the paper; default in the sampled loop: "
+                "l / J of at most half of the rate p of the hold phase",
     )  # fmt: skip
     disturbance_rate_bound: Leaf  # pyright: ignore[reportGeneralTypeIssues]  # c of Assumption 1, bound on each component of d' [N m/s]
     initial_error: Leaf  # pyright: ignore[reportGeneralTypeIssues]  # bound on |d_hat(0) - d(0)| [N m]; (57) needs it, but the paper has no value

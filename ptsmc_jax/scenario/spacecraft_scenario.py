@@ -63,8 +63,9 @@ class Spacecraft(Table, frozen=True):
     inertia: Annotated[
         Inertia,
         Meaning(
-            "three principal moments, or a symmetric 3x3 tensor with the entries -sum m x y off its diagonal. With "
-            "[wheels] it is the inertia of the whole spacecraft minus the spin inertia of each wheel about its axis",
+            "three principal moments, or a symmetric 3x3 tensor. Off its diagonal are the sums of -m x y: if your "
+            "CAD program prints the sums of m x y, change their sign. With [wheels] it is the inertia of the whole "
+            "spacecraft minus the spin inertia of each wheel about its axis",
             "kg m^2",
         ),
     ] = (10.0, 12.0, 14.0)
