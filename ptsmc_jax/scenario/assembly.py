@@ -16,6 +16,7 @@ from ptsmc_jax.numerics.pytrees import listing, vector
 from ptsmc_jax.plants.base import Plant
 from ptsmc_jax.scenario import custom_checks, reading, start_checks, timing
 from ptsmc_jax.scenario import tables as t
+from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.signals import disturbances
 from ptsmc_jax.simulation import catalogues
@@ -121,7 +122,13 @@ def study(
     dispersion = build_dispersion(scenario, parts)
     custom_checks.check(parts, dispersion, scenario)
     start_checks.check(scenario, parts, dispersion, dispersed=drawn)
-    return Study(scenario, parts, dispersion, requirements(scenario), margin_requirements(scenario))
+    margins = margin_requirements(scenario)
+    missing = custom_checks.describe_missing_derivative(parts, scenario) if margins else None
+    if missing is not None:
+        raise ScenarioError(
+            f"requirements.{margins[0].metric}: required margins need the derivative of the law, but {missing}"
+        )
+    return Study(scenario, parts, dispersion, requirements(scenario), margins)
 
 
 def build_setup(scenario: Scenario) -> Parts:

@@ -48,6 +48,82 @@ def check(parts: Parts, dispersion: Dispersion, scenario: Scenario) -> None:
         _check_draw(parts, dispersion, _Checker("dispersion.custom", getattr(scenario.dispersion, "custom", None)))
 
 
+def describe_missing_derivative(parts: Parts, scenario: Scenario) -> str | None:
+    """Return in words that the derivatives of a custom law by the error are zero, or None if they are not.
+
+    The derivatives of the discontinuous sign, of a rounded number and of `stop_gradient` are zero, although the law
+    reacts to the error. They are evaluated at several errors, because derivatives are also zero beyond a limit and in a
+    dead zone. A law with `__call__` is not checked.
+
+    Args:
+        parts: the parts of a run.
+        scenario: the scenario that they are built from.
+
+    Raises:
+        ScenarioError: JAX cannot differentiate the law.
+    """
+    if not _has_custom_acceleration(parts, scenario):
+        return None
+    differentiate, _, errors = _derivatives_of_law(parts)
+    points = [jax.tree.map(lambda v, k=k: k * jnp.where(v == 0.0, 0.1, v), errors) for k in (1.0, 0.1, 1e-3, 1e-6)]
+    beginning = f"{_Checker('controller', scenario.controller).beginning} acceleration"
+    try:
+        for point in points:
+            for hold in (False, True):
+                if any(np.any(np.asarray(v) != 0.0) for v in jax.tree.leaves(differentiate({}, point, hold))):
+                    return None
+    except Exception as error:  # for example jax.pure_callback
+        raise ScenarioError(f"{beginning} cannot be differentiated: {systems.describe_failure(error, '')}") from None
+    return (
+        f"{beginning} has zero derivatives by the error; use jax.numpy.tanh(s / width) instead of sign, and neither "
+        "round nor stop_gradient"
+    )
+
+
+def describe_infinite_derivative(parts: Parts, scenario: Scenario) -> str | None:
+    """Return in words that a custom law has a derivative at its first sample that is not finite, or None.
+
+    Args:
+        parts: the parts of a run.
+        scenario: the scenario that they are built from.
+    """
+    if not _has_custom_acceleration(parts, scenario):
+        return None
+    differentiate, gains, errors = _derivatives_of_law(parts)
+    if all(np.all(np.isfinite(v)) for v in jax.tree.leaves(differentiate(gains, errors, False))):
+        return None
+    return (
+        f"{_Checker('controller', scenario.controller).beginning} acceleration has a derivative at t = 0 that is not "
+        "finite; add a small constant inside a square root or a norm, whose derivative at zero is not finite"
+    )
+
+
+def _has_custom_acceleration(parts: Parts, scenario: Scenario) -> bool:
+    """Return whether the law is custom and defines `acceleration`, but not `__call__`."""
+    return isinstance(scenario.controller, Custom) and type(parts.controller).__call__ is Law.__call__
+
+
+def _derivatives_of_law(parts: Parts) -> tuple[Callable, dict[str, Any], tuple[Any, Any]]:
+    """Return the derivatives of a law's acceleration and memory at t = 0, its gains by name, and the initial errors.
+
+    The derivatives are a function of gains by name, the errors (eps, eps') and whether the sample is in the hold phase.
+    They are by these gains and errors.
+    """
+    law: Any = parts.controller
+    zero = jnp.zeros_like(parts.t_end)
+    target = parts.reference(zero)
+    k2 = parts.observer.error_bound()(zero)
+
+    def outputs(gains: dict[str, Any], errors: tuple[Any, Any], hold: Any) -> list[Any]:
+        now = Sample(zero, jnp.asarray(hold), jnp.asarray(parts.period), law.begin())
+        a, _, *memory = dataclasses.replace(law, **gains).acceleration(now, *errors, k2)
+        return [v for v in jax.tree.leaves((a, memory)) if jnp.issubdtype(jnp.result_type(v), jnp.inexact)]
+
+    errors = law.kinematics.errors(law.kinematics.align(parts.plant.visible(parts.initial), target), target)
+    gains = {name: jnp.asarray(getattr(law, name)) for name in law.tunable}
+    return jax.jit(jax.jacfwd(outputs, argnums=(0, 1))), gains, errors
+
+
 def describe_failure(error: BaseException, file: str) -> str:
     """Return the reason why custom code in a file failed when it was called or traced, as the end of a sentence."""
     if isinstance(error, TRACING_ERRORS):
@@ -68,7 +144,7 @@ class _Checker:
 
     def __init__(self, name: str, table: Any):
         shown = brief(table.code) if isinstance(table.code, str) else table.part_class.__name__
-        self._beginning, self._made = f"{name}.code is {shown}, whose", table.part_class
+        self.beginning, self._made = f"{name}.code is {shown}, whose", table.part_class
 
     def __call__(self, method: str, function: Callable, *args: object) -> Any:
         """Return the value of a method of the custom class, after it has also been traced.
@@ -91,7 +167,7 @@ class _Checker:
             return returned
         except (Exception, SystemExit) as error:
             reason = describe_failure(error, inspect.getsourcefile(self._made) or "")
-            raise ScenarioError(f"{self._beginning} {method} {reason}") from None
+            raise ScenarioError(f"{self.beginning} {method} {reason}") from None
 
     def error(self, method: str, returned: str, allowed: str) -> ScenarioError:
         """Return the error for a returned value.
@@ -101,7 +177,7 @@ class _Checker:
             returned: description of the returned value.
             allowed: description of the required value.
         """
-        return ScenarioError(f"{self._beginning} {method} returns {returned} at t = 0, but must return {allowed}")
+        return ScenarioError(f"{self.beginning} {method} returns {returned} at t = 0, but must return {allowed}")
 
     def check(self, method: str, allowed: str, value: object, example: object, *, exact: bool = False) -> None:
         """Raise ScenarioError if a value has not the structure and shapes of an example.

@@ -25,7 +25,8 @@ SYSTEM_NAME_FORMS = f"{NAME_FORMS}, a system made with plants.system"
 OWN_PACKAGES = ("ptsmc_jax", "tuning")  # packages that are never helpers of custom code
 
 
-_NO_DERIVATIVES = re.compile("support JVP|Differentiation rule for")  # in JAX's messages for code without derivatives
+# in JAX's messages for code without derivatives or batches
+_NOT_SUPPORTED = re.compile("support JVP|Differentiation rule for|vmap is only supported for")
 _executed_paths: set[str] = set()  # real paths of all files that were run
 _executed_files: dict[tuple[str, str], ModuleType] = {}  # by path and checksum, so that a changed file is run again
 # modules that custom files imported from their own folder: path and SHA-256 by name
@@ -114,10 +115,10 @@ def describe_failure(error: BaseException, place: str) -> str:
 def find_faulty_file(error: BaseException) -> str | None:
     """Return the custom file that caused an error, None if no custom code is involved.
 
-    JAX reports leaked tracers and missing derivatives later, when no custom file is in the traceback. All custom files
-    that were run are then returned, joined by "or".
+    JAX reports leaked tracers, missing derivatives and missing batches later, when no custom file is in the traceback.
+    All custom files that were run are then returned, joined by "or".
     """
-    if type(error).__name__ == "UnexpectedTracerError" or _NO_DERIVATIVES.search(str(error)):
+    if type(error).__name__ == "UnexpectedTracerError" or _NOT_SUPPORTED.search(str(error)):
         return " or ".join(sorted(_executed_paths)) or None
     files = [os.path.realpath(frame.f_code.co_filename) for frame, _ in traceback.walk_tb(error.__traceback__)]
     return next((file for file in reversed(files) if file in _executed_paths), None)

@@ -276,6 +276,9 @@ TUNINGS: dict[str, Callable[[], Any]] = {
         saturated={"mean": 0.0, "rms": 0.0, "max": 0.0})),
     "margins without the discontinuous sign": lambda: diagnostics(margins={"hold": HOLD}, gradient_error=None),
     "margins and gradients": lambda: diagnostics(margins={"hold": HOLD}, gradient_error={"start": 1e-9, "end": 1e-9}),
+    "no finite gradients": lambda: diagnostics(
+        margins={"hold": HOLD}, gradient_error=None, without_gradients="no measured gains have finite gradients"
+    ),
     "gradients are not checked": lambda: diagnostics(gradient_error={"start": None, "end": None}),
     "gradients are checked at the start": lambda: diagnostics(gradient_error={"start": 1e-9, "end": None}),
     "wrong gradients": lambda: diagnostics(gradient_error={"start": 3.0, "end": 2.0}),

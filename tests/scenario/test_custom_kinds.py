@@ -16,12 +16,13 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.laws.base import Sample
 from ptsmc_jax.onboard.board import build_board
-from ptsmc_jax.scenario import custom, parsing, reading, systems
+from ptsmc_jax.scenario import custom, custom_checks, parsing, reading, systems
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
 from tests.helpers import ROOT, SHORT, SHORT_CHAIN, short, small_search, vector
 from tests.scenario.bad_scenarios import check_sentence
 from tuning.search import gains
+from tuning.studies import posing, stability
 
 HEAD = "import jax.numpy as jnp\nimport ptsmc_jax as ptsmc\n\n"
 LAW = """
@@ -465,6 +466,77 @@ def test_errors_in_custom_code_during_a_run_are_one_sentence(command, here, monk
     with pytest.raises(ValueError, match="JVP") as no_slopes:  # as in a search: the traceback contains only JAX
         jax.jvp(lambda x: jax.pure_callback(lambda x: x, x, x), (1.0,), (1.0,))
     assert systems.find_faulty_file(no_slopes.value) == str(here / "mine.py")
+    with pytest.raises(NotImplementedError) as no_batches:  # as in a campaign
+        jax.vmap(lambda x: jax.pure_callback(lambda x: x, x, x))(jnp.zeros(2))
+    assert systems.find_faulty_file(no_batches.value) == str(here / "mine.py")
+
+
+def changed_law(here, command):
+    """Return the tables of a scenario whose law returns this acceleration, a Python expression."""
+    body = f"import jax\n{HEAD}{LAW}".replace("return 0.5 * wanted, s", f"return {command}, s")
+    (here / "mine.py").write_text(body)
+    return {**CHAIN, "controller": MINE}
+
+
+@pytest.mark.parametrize(("command", "reason"), [
+    ("jax.lax.stop_gradient(wanted)", "zero derivatives"),
+    ("jnp.round(1e4 * wanted) / 1e4", "zero derivatives"),
+    ("-jnp.sign(s)", "zero derivatives"),
+    ("0.5 * wanted", None),
+    ("jnp.clip(wanted, -1e-4, 1e-4)", None),  # saturated at t = 0
+    ("jnp.where(jnp.abs(error) < 0.05, 0.0, wanted)", None),  # a dead zone
+    ("-jnp.sign(s) - error", None),
+])  # fmt: skip
+def test_margins_of_a_law_without_a_derivative_are_refused(here, command, reason):
+    """An earlier version reported the margins of the loop without the law, and an unstable loop."""
+    tables = changed_law(here, command)
+    required = scenario.from_tables({**tables, "requirements": {"gain_margin": 6.0}})
+    ready = scenario.study(scenario.from_tables(tables))
+    missing = custom_checks.describe_missing_derivative(ready.parts, ready.scenario)
+    if reason is None:
+        assert missing is None
+        scenario.study(required)
+        return
+    assert missing is not None
+    for refuse, name in ((scenario.study, "requirements.gain_margin"), (stability.find_margins, "")):
+        with pytest.raises(ScenarioError) as caught:
+            refuse(required if name else ready.scenario)
+        check_sentence(str(caught.value).replace("Error", ""), f"{name}", reason)
+        assert 'controller.code is "mine.py:Mine"' in str(caught.value)
+    assert stability.worst_margins(ready) is None
+    tuned = posing.set_up_tuning(posing.with_tune(ready.scenario), 0)
+    assert not tuned.settings.with_gradients  # differential evolution
+
+
+@pytest.mark.parametrize(("command", "is_finite"), [
+    ("wanted - jnp.linalg.norm(error_rate) * error_rate", False), ("wanted - jnp.sum(error_rate**2) * error_rate", True)
+])  # fmt: skip
+def test_a_derivative_that_is_not_finite_at_rest_is_described(here, command, is_finite):
+    ready = scenario.study(scenario.from_tables(changed_law(here, command)))
+    assert custom_checks.describe_missing_derivative(ready.parts, ready.scenario) is None
+    assert (custom_checks.describe_infinite_derivative(ready.parts, ready.scenario) is None) == is_finite
+
+
+def test_margins_and_tuning_of_a_law_that_jax_cannot_differentiate_are_refused(here):
+    """An earlier message named all custom files instead of the class."""
+    tables = changed_law(here, "jax.pure_callback(lambda v: v, wanted, wanted)")
+    tuned = posing.with_tune(scenario.study(scenario.from_tables(tables)).scenario)
+    required = scenario.from_tables({**tables, "requirements": {"gain_margin": 6.0}})
+    for refuse in (
+        lambda: stability.find_margins(tuned),
+        lambda: scenario.study(required),
+        lambda: posing.set_up_tuning(tuned, 0),
+    ):
+        with pytest.raises(ScenarioError, match=r"mine.py:Mine.* acceleration cannot be differentiated: ValueError"):
+            refuse()
+
+
+def test_a_law_that_reacts_through_its_memory_has_a_derivative(here):
+    """The command is the error of the sample before."""
+    late = REMEMBERS.replace("return 0.5 * wanted, s", "return -now.memory, s, error")
+    (here / "mine.py").write_text(HEAD + late)
+    ready = scenario.study(scenario.from_tables({**CHAIN, "controller": MINE}))
+    assert custom_checks.describe_missing_derivative(ready.parts, ready.scenario) is None
 
 
 def test_an_absent_custom_file_is_refused_and_not_reported_as_run(command, here):

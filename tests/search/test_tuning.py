@@ -528,6 +528,22 @@ def test_a_search_without_gradients_finds_the_same_optimum(monkeypatch):
     np.testing.assert_allclose(found[False].value, found[True].value, rtol=1e-3)
 
 
+def test_differential_evolution_finds_the_gains_if_no_gradients_are_finite(monkeypatch):
+    """An earlier search stopped at the first gains and reported that no gains meet the requirements."""
+    helpers.small_search(monkeypatch)
+    monkeypatch.setattr(local_searches, "SOBOL_POINTS", 64)
+
+    class WithoutGradients(Evaluator):
+        def measure_with_gradients(self, problem, normalised):
+            measured = super().measure_with_gradients(problem, normalised)
+            return replace(measured, f_gradient=np.full_like(measured.f_gradient, np.nan))
+
+    start = np.array([3.0, 0.5])
+    found = optimise.search(WithoutGradients(WITHIN), problem(), (), start, optimise.Settings(3, 40, 1))
+    assert not found.with_gradients
+    assert found.value < 0.9 * np.exp(evaluated_at(problem(), *start)[2])
+
+
 def test_statistics_of_a_tuning_count_failed_trials_and_cover_the_others(monkeypatch):
     """A metric whose larger values are better has a minimum and a quantile of 1 % instead of 99 %."""
     trials = simulations.simulate_trials(problem().batch_of(np.arange(8)), np.array([3.0, 0.5]))

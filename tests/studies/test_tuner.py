@@ -140,7 +140,9 @@ def test_accuracy_gain_uses_trials_that_both_sets_of_gains_finish():
 def test_influence_of_a_gain_is_unknown_if_no_trial_finishes(objective, said):
     """If no trial has an objective, its replacement value is equal for all gains, which is no evidence."""
     profile = trust.Profile(np.arange(3.0), np.full(3, objective), np.ones(3), np.zeros(3))
-    found: Any = SimpleNamespace(gradient_error=None, profiles={"eta": profile}, sensitivities={}, margins={})
+    found: Any = SimpleNamespace(
+        gradient_error=None, without_gradients=None, profiles={"eta": profile}, sensitivities={}, margins={}
+    )
     tuning: Any = SimpleNamespace(tuned=SimpleNamespace(sampled=True, hardware=None), at_bound={"eta": "upper"})
     assert tune_files._trust_entry(found, tuning)["influence"] == {"eta": said}
 
@@ -171,6 +173,7 @@ class Found:
     problem: Any = None
     violation: float = 0.0
     interrupted: bool = False
+    with_gradients: bool = True
     history: tuple[Step, ...] = ()
 
     @property
@@ -184,7 +187,7 @@ class Rising:
 
     def __init__(self, made: scenario.Scenario, searched: list[dict[str, tuple[float, float]]]):
         self.ready, self.problem = SimpleNamespace(scenario=made), None
-        self.settings = SimpleNamespace(seed=0, with_gradients=True)
+        self.settings = SimpleNamespace(seed=0)
         self.searched, names = searched, tuple(made.search.bounds)
         lower, upper = zip(*made.search.bounds.values(), strict=True)
         bounds = normalisation.Bounds(names, lower, upper)

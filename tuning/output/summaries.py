@@ -105,6 +105,7 @@ class Trust(msgspec.Struct, frozen=True):
     influence: dict[str, str]
     margins: dict[str, Row] | None  # by phase, see `stability.worst_margins`
     gradient_error: Numbers | None
+    without_gradients: str | None = None  # reason for a search without gradients; None also for a discontinuous sign
 
 
 class Tune(msgspec.Struct, frozen=True, kw_only=True):

@@ -353,17 +353,15 @@ def diagnostic_lines(summary: Tune) -> Iterator[str]:
     required = gradients is None or any(v.metric in MARGINS for v in summary.verdicts)
     yield from margins_report.tuned_margin_lines(trust.margins, required=required)
     if gradients is None:
-        if trust.margins:
+        if trust.margins and trust.without_gradients is None:
             yield NO_SIGN
-        yield (
-            "differential evolution found the gains, because the discontinuous sign has no gradients; tune.free may "
-            "name sign_width"
-        )
+        reason = trust.without_gradients or "the discontinuous sign has no gradients; tune.free may name sign_width"
+        yield f"differential evolution found the gains, because {reason}"
         return
     known_errors = {place: value for place, value in gradients.items() if value is not None}
     error_texts = " and ".join(f"{value:.0e} at the {place}" for place, value in known_errors.items())
     if not known_errors:
-        yield "the gradients are not checked: the error is zero, or no trial reaches its end"
+        yield "the gradients are not checked: the error is zero, no trial reaches its end, or a gradient is not finite"
     elif max(known_errors.values()) <= GRADIENT_TOLERANCE:
         yield f"gradients agree with finite differences to {error_texts}"
     else:

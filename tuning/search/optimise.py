@@ -1,8 +1,8 @@
 """The search for gains: local searches with gradients from a few starting points. Read `search` first.
 
 Sobol points are simulated to choose the starting points. Sequential quadratic programming (SciPy's SLSQP) then follows
-the gradients of the simulation. A law with a discontinuous sign has no useful gradients, so its gains are found by
-differential evolution.
+the gradients of the simulation. Differential evolution replaces it if there are no useful gradients, for example with a
+discontinuous sign.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -58,6 +58,7 @@ class Search:
     # if no gains meet every requirement: the limits that conflict, see `LocalSearches.find_conflicts`
     conflict: dict[str, float | None] = field(default_factory=dict)
     searched_globally: bool = False  # whether a global search of the whole box followed
+    with_gradients: bool = True  # whether the search used gradients; False: differential evolution found the gains
     hardest: Hardest | None = None  # worst case of the gains; None: no requirement on every trial
     counts: list[confirm.Count] = field(default_factory=list)  # confirmations of quantile requirements
     interrupted: bool = False
@@ -103,8 +104,8 @@ def search(
     try:
         if with_gradients:
             prepare()
-            _search_with_gradients(rounds, local_searches, scenario_gains, settings, announce)
-        else:
+            with_gradients = _search_with_gradients(rounds, local_searches, scenario_gains, settings, announce)
+        if not with_gradients:
             _search_without_gradients(rounds, local_searches, scenario_gains, announce)
         if settings.judged:
             rounds.find_worst_case(local_searches.gains, announce)
@@ -131,6 +132,7 @@ def search(
         violation=best.violation,
         conflict=conflict,
         searched_globally=local_searches.searched_globally,
+        with_gradients=with_gradients,
         hardest=rounds.hardest,
         counts=[] if interrupted else rounds.counts,
         interrupted=interrupted,
@@ -139,21 +141,28 @@ def search(
 
 def _search_with_gradients(
     rounds: Rounds, local_searches: LocalSearches, scenario_gains: np.ndarray, settings: Settings, announce: Announce
-) -> None:
+) -> bool:
     """Run local searches from several starting points, and search again with harder trials.
 
     If no gains meet every requirement, search globally. The results are in `local_searches`.
+
+    Returns:
+        Whether gradients are finite at some starting point. If not, there are no results.
     """
     starts, seed = settings.starts, settings.seed
     local_searches.begin(rounds.problem, scenario_gains, settings.designs)
     rounds.begin(local_searches.gains)
     best = local_searches.explore(rounds.problem, starts, seed) if starts > 1 else {0: local_searches.normalised}
+    if not local_searches.started:
+        announce("no finite gradients: searching without gradients")
+        return False
     local_searches.search_locally(rounds.problem, best)
     _repeat_with_harder_trials(rounds, local_searches, local_searches.continue_best, announce)
     if starts > 1 and local_searches.best.violation > 0.0:
         announce("no gains that meet every requirement are found yet: searching globally")
         local_searches.search_globally(rounds.problem, starts, seed + 1)
         _repeat_with_harder_trials(rounds, local_searches, local_searches.continue_best, announce)
+    return True
 
 
 def _search_without_gradients(

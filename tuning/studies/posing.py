@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from ptsmc_jax.scenario import Study, free_gains, replace, study, tables
+from ptsmc_jax.scenario import Study, custom_checks, free_gains, replace, study, tables
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.timing import Reach, reach_of
 from ptsmc_jax.simulation.requirements import Requirement
@@ -34,7 +34,7 @@ class TuningSetup:
     problem: Problem
     evaluate: Evaluator
     scenario_gains: np.ndarray  # (gains,) gains of the scenario
-    settings: Settings  # options of the search; F has no useful gradients with the discontinuous sign
+    settings: Settings  # options of the search; F has no useful gradients if the law has no derivative
     constraints: list[Requirement]  # constraints of the search
 
     def search(
@@ -111,12 +111,13 @@ def set_up_tuning(scenario: Scenario, seed: int, journal: Journal | None = None,
         torque_weight=tune.torque_weight,
     )
     is_discontinuous = scenario.has_discontinuous_sign and "sign_width" not in bounds.names
-    if not is_discontinuous:  # start before the margins, so that these programs compile meanwhile
+    has_derivative = not is_discontinuous and custom_checks.describe_missing_derivative(ready.parts, scenario) is None
+    if has_derivative:  # start before the margins, so that these programs compile meanwhile
         simulations.prepare(problem.batch, objective.needed_metrics(problem))
     problem = dataclasses.replace(problem, margins=margin_rows.build_required_margins(ready, bounds, seed))
     scenario_gains = np.asarray(gains.present_values(ready.parts, bounds.names))
     designs = np.asarray(gains.design_gains(scenario, ready.parts, bounds.names))
-    settings = Settings(tune.starts, tune.steps, seed, not is_discontinuous, tune.worst_case, designs=designs)
+    settings = Settings(tune.starts, tune.steps, seed, has_derivative, tune.worst_case, designs=designs)
     return TuningSetup(ready, problem, Evaluator(bounds, journal), scenario_gains, settings, requirements)
 
 

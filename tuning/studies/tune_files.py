@@ -164,6 +164,7 @@ def _trust_entry(trust_results: Trust, tuning: Tuning) -> dict[str, object]:
     errors = trust_results.gradient_error
     return {
         "gradient_error": None if errors is None else dict(zip(("start", "end"), errors, strict=True)),
+        "without_gradients": trust_results.without_gradients,
         "influence": influence,
         "sensitivities": trust_results.sensitivities,
         "margins": trust_results.margins,

@@ -13,7 +13,7 @@ import numpy as np
 
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.campaigns.montecarlo import Trials
-from ptsmc_jax.scenario import free_gains, study
+from ptsmc_jax.scenario import custom_checks, free_gains, study
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation.requirements import Verdict
@@ -42,7 +42,8 @@ SENSITIVITY_METRICS = ("window_error", "hold_error", "peak_torque", "effort", "c
 class Trust:
     """Checks of a result: gradient errors, profiles, sensitivities and stability margins, see `trust`."""
 
-    gradient_error: tuple[float, float] | None  # relative error at the first and last point; None: discontinuous sign
+    gradient_error: tuple[float, float] | None  # relative error at the first and last point; None: no gradients
+    without_gradients: str | None  # reason in words for a search without gradients; None also for a discontinuous sign
     profiles: dict[str, Profile]  # objective along each gain
     sensitivities: dict[str, dict[str, float]]
     margins: dict[str, dict[str, Any]] | None  # stability margins of the tuned gains, see `stability.worst_margins`
@@ -158,7 +159,7 @@ def tune(
     outcome, rollouts, gradients = judged.search, evaluate.rollouts, evaluate.gradients
     check = None
     if with_global_check and not outcome.interrupted:
-        check = global_check.check(evaluate, outcome, seed, report, with_gradients=setup.settings.with_gradients)
+        check = global_check.check(evaluate, outcome, seed, report, with_gradients=outcome.with_gradients)
     problem = setup.problem
     training = simulations.simulate_trials(
         problem.batch_of(np.arange(problem.averaged)), np.asarray([*judged.gains.values()])
@@ -248,7 +249,7 @@ def _search_in_wider_bounds(
     """
     default_bounds = setup.ready.scenario.defaulted
     for k in range(MOST_WIDENINGS):
-        if outcome.interrupted or not setup.settings.with_gradients:
+        if outcome.interrupted or not outcome.with_gradients:
             break
         sides = _relevant_bounds(setup, outcome, setup.evaluate.bounds.at_bound(outcome.gains))
         scenario = setup.ready.scenario
@@ -332,16 +333,26 @@ def _check_result(setup: TuningSetup, judged: _Judged) -> Trust:
     """Compute gradient errors, profiles, sensitivities and margins of the gains found."""
     outcome, evaluate = judged.search, setup.evaluate
     gradient_error = None
-    if setup.settings.with_gradients:
+    if outcome.with_gradients:
         at_start = trust.gradient_error(evaluate, outcome.problem, evaluate.bounds.normalise(setup.scenario_gains))
         gradient_error = at_start, trust.gradient_error(evaluate, outcome.problem, outcome.normalised)
     metrics = tuple(dict.fromkeys([*SENSITIVITY_METRICS, *outcome.problem.metrics]))
     return Trust(
         gradient_error=gradient_error,
+        without_gradients=None if outcome.with_gradients else _describe_missing_gradients(setup),
         profiles=trust.profiles(evaluate, outcome.problem, outcome.normalised),
         sensitivities=trust.sensitivities(outcome.problem, evaluate.bounds, outcome.gains, metrics),
         margins=stability.worst_margins(study(judged.tuned)),
     )
+
+
+def _describe_missing_gradients(setup: TuningSetup) -> str | None:
+    """Return in words why a search had no gradients, or None for a discontinuous sign."""
+    ready = setup.ready
+    if setup.settings.with_gradients:
+        cause = custom_checks.describe_infinite_derivative(ready.parts, ready.scenario)
+        return "no measured gains have finite gradients" + ("" if cause is None else f"; {cause}")
+    return custom_checks.describe_missing_derivative(ready.parts, ready.scenario)
 
 
 def _broken_ratios(outcome: Search, verdicts: list[Verdict]) -> dict[str, float]:
