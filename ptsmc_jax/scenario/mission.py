@@ -184,6 +184,8 @@ def describe_default_gains(scenario: "Scenario") -> str | None:
     if not names or not all(("controller", name) in scenario.defaulted for name in names):
         return None
     text = "the scenario states no gains of the law, so these are default gains"
+    if law.kind == "custom":
+        return "the scenario states no gains of the law, so these are the defaults of its class"
     if law.kind != "prescribed_time" or not scenario.sampled or is_published_case(scenario):
         return text
     limits, (slowest, pole, _) = _pole_limits(scenario), _pole_range(scenario)

@@ -16,7 +16,7 @@ from ptsmc_jax import scenario
 from ptsmc_jax.campaigns import montecarlo
 from ptsmc_jax.laws.base import Sample
 from ptsmc_jax.onboard.board import build_board
-from ptsmc_jax.scenario import custom, custom_checks, parsing, reading, systems
+from ptsmc_jax.scenario import custom, custom_checks, mission, parsing, reading, systems
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.simulation import rollout
 from tests.helpers import ROOT, SHORT, SHORT_CHAIN, short, small_search, vector
@@ -136,6 +136,15 @@ def test_a_scenario_with_custom_code_can_be_pickled_before_and_after_the_code_ru
         again = pickle.loads(pickle.dumps(read))
         assert again == read
         assert custom.has_unloaded_code(again) == custom.has_unloaded_code(read)
+
+
+def test_default_gains_of_a_custom_law_are_reported_as_defaults_of_its_class():
+    """They do not follow from the numbers of the scenario, unlike the default gains of other laws."""
+    without_gains, with_gain = (
+        reading.complete(scenario.from_tables({**CHAIN, "controller": {**MINE, **law}})) for law in ({}, {"eta": 3.0})
+    )
+    assert "its class" in str(mission.describe_default_gains(without_gains))
+    assert mission.describe_default_gains(with_gain) is None
 
 
 def test_custom_gains_can_be_set_in_parts_and_in_the_scenario():
