@@ -242,8 +242,17 @@ def settling_by_angle(sets: Mapping[str, tuple[np.ndarray, np.ndarray]], t_f: fl
     for (label, (angle, time)), (colour, marker), above in looks:  # the first set is drawn above the others
         settled, name = np.isfinite(time), label.replace("_", " ")
         name = name if np.all(settled) else f"{name}: {np.count_nonzero(~settled)} never"
+        # markers are not filled, so that laws with equal times stay visible
         axes.plot(
-            angle[settled], time[settled], marker, ms=3.5, alpha=0.8, color=colour, mew=0, label=name, zorder=2 + above
+            angle[settled],
+            time[settled],
+            marker,
+            ms=3.5,
+            mew=0.7,
+            mfc="none",
+            color=colour,
+            label=name,
+            zorder=2 + above,
         )
     axes.axhline(t_f, color="0.3", lw=0.9, ls=":")
     axes.annotate("$t_f$", (1.0, t_f), xycoords=("axes fraction", "data"), xytext=(4, 0), textcoords="offset points",

@@ -132,7 +132,7 @@ def test_tune_command_writes_its_results_and_a_second_call_shows_them(command, t
     assert len(read.charts["search"]["data"]) == summary["search"]["starts"]
     gains = ", ".join(f"{name} {value:.6g}" for name, value in summary["gains"].items())
     assert read.text.index(f"gains: {gains}") < read.text.index("Requirements")  # at once, with the verdict
-    assert "These are the gains before the search" in read.text[read.text.index("Scenario") :]
+    assert "These are the gains of the scenario" in read.text[read.text.index("Scenario") :]
     (verdict,) = summary["verdicts"]
     assert f"{100 * verdict['margin']:.3g} % of the limit" in read.text
 

@@ -31,7 +31,7 @@ def tune(search: dict[str, Any] | None = None, trust: dict[str, Any] | None = No
         "status": "met", "plant": "spacecraft", "gain_units": {}, "gains": {}, "at_bound": {},
         "widened_bounds": {}, "accuracy_gain_over_published": None, "accuracy_gain_interval": None,
         "training": group(), "held_out": group(),
-        "published_unavailable": None, "published_label": "published", "shortest_t_f": None, "broken_by": {},
+        "published_unavailable": None, "published_label": "published gains", "shortest_t_f": None, "broken_by": {},
         "verdicts": [],
         "judged_on": "flight clock", "warnings": [], "differential_evolution": None,
     }  # fmt: skip

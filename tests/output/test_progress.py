@@ -142,4 +142,9 @@ def test_progress_line_names_the_compilation_that_a_step_waits_for(capsys, monke
     with progress.Progress(quiet=False) as tell:
         tell("searching", 1, 7)
         time.sleep(0.2)
-    assert set(capsys.readouterr().err.splitlines()) == {"ptsmc: compiling the gradients, 2 of 3, 0 s so far"}
+        tell("pd, law 2 of 9: searching", 1, 7)
+        time.sleep(0.2)
+    assert list(dict.fromkeys(capsys.readouterr().err.splitlines())) == [
+        "ptsmc: compiling the gradients, 2 of 3, 0 s so far",
+        "ptsmc: pd, law 2 of 9: compiling the gradients, 2 of 3, 0 s so far",
+    ]

@@ -195,7 +195,7 @@ def margins_of(required: bool = False, **ends: dict[str, Any]) -> Iterable[str]:
 FEW = {"gain_margin": 5.9, "phase_margin": 0.0, "peak_sensitivity": 7.0}
 UNLIMITED = {"gain_margin": None, "phase_margin": 61.0, "delay_margin": None, "peak_sensitivity": 1.0}
 HOLD = {"stable": True, "gain_margin": 9.0, "phase_margin": 40.0, "delay_margin": 0.1, "peak_sensitivity": 3.0}
-SCALED = {"published_label": "published, scaled", "accuracy_gain_interval": [0.05, 0.1]}
+SCALED = {"published_label": "published gains, scaled", "accuracy_gain_interval": [0.05, 0.1]}
 TUNINGS: dict[str, Callable[[], Any]] = {
     "tuned": lambda: tune_report.build(
         examples.tune(held_out=HELD_OUT, published=LOST, verdicts=[examples.torque(0.9)])
@@ -241,7 +241,9 @@ TUNINGS: dict[str, Callable[[], Any]] = {
     "tuned gains with their units": lambda: accuracy(
         None, gains={"eta": 3.0, "observer_gain_2": 0.5}, gain_units={"eta": "-", "observer_gain": "N m s"}
     ),
-    "more accurate than the paper's law": lambda: accuracy(40.0, published_label="paper's law"),
+    "more accurate than the published law": lambda: accuracy(
+        40.0, published_label="published gains, prescribed-time law"
+    ),
     "all held-out trials fail": lambda: accuracy(
         0.08, held_out=examples.group(counts={"ok": 0, "not_converged": 60, "diverged": 4})
     ),
@@ -301,7 +303,7 @@ def front(*points: Point, **changes: Any) -> Front:
     known: Any = {
         "against": "torque", "plant": "spacecraft", "points": list(points), "idle": [], "without": [], "trials": 1000,
         "seed": 1, "interval_confidence": 0.95, "lower_bound": None, "rollouts": 1, "gradients": 1, "requirements": [],
-        "gain_units": {"eta": "-", "observer_gain": "kg m^2/s"}, "warnings": [], "published_label": "published",
+        "gain_units": {"eta": "-", "observer_gain": "kg m^2/s"}, "warnings": [], "published_label": "published gains",
     }  # fmt: skip
     return read(to_json_value(Front(**known | changes).summary()))
 
@@ -337,7 +339,7 @@ FRONTS: dict[str, Callable[[], Front]] = {
         requirements=["effort"], published_unavailable="eta is 2",
     ),
     "a point without a completed trial": lambda: front(NO_TRIAL, others={"published": NO_TRIAL}),
-    "gains by axis": lambda: front(BY_AXIS, others=WITHOUT_AXES, published_label="published, scaled"),
+    "gains by axis": lambda: front(BY_AXIS, others=WITHOUT_AXES, published_label="published gains, scaled"),
     "a limit exceeded on held-out trials": lambda: front(
         robust(math.inf, 1e-5), robust(6.0, 2e-5, gain_margin=-100.0, peak_sensitivity=100.0),
         robust(4.0, 3e-5, peak_sensitivity=4.02), against="margins", plant="chain",
@@ -570,7 +572,7 @@ OTHERS: dict[str, Callable[[], Any]] = {
     "pointing budget without an angle": lambda: [
         budget(2000, 2000), budget(1108, 1098), budget(1109, 1099), budget(1109, 1049, 50),
     ],
-    "most accurate law, also without an error": lambda: [most_accurate_law(2e-6), most_accurate_law(0.0)],
+    "most accurate law, also without an error": lambda: [most_accurate_law(error) for error in (2e-6, 3.999e-6, 0.0)],
     # the bound is 0 without noise, and None if no run reaches its end
     "angles of a campaign in arcsec and deg": quantiles_of_angles,
     "run without a lower bound": lambda: [text_of(run(None)), text_of(run(0.0))],
@@ -631,12 +633,12 @@ def test_chart_of_a_front_has_intervals_knee_limit_and_no_point_without_an_error
     drawn = page_charts.front(front(*points, others=others), 1.5)
     named = {trace["name"]: trace for trace in drawn["data"]}
     assert {name: trace["x"] for name, trace in named.items()} == {
-        "front": [1.0, 2.0], "knee": [1.0], "dominated": [3.0], "published": [5.0],
+        "front": [1.0, 2.0], "knee": [1.0], "dominated": [3.0], "published gains": [5.0],
     }  # fmt: skip
     arcsec = 2.0 * np.degrees(1.0) * 3600.0  # of a small error |v|, to 1e-9
     np.testing.assert_allclose(named["front"]["error_y"]["array"], arcsec * np.array([0.8e-5, 0.2e-5]), rtol=1e-7)
     np.testing.assert_allclose(named["front"]["error_y"]["arrayminus"], arcsec * np.array([0.4e-5, 0.1e-5]), rtol=1e-7)
-    assert named["published"]["error_y"]["array"] == [0.0]
+    assert named["published gains"]["error_y"]["array"] == [0.0]
     assert drawn["layout"]["shapes"][0]["x0"] == 1.5
     assert "peak torque [N m]" in json.dumps(drawn["layout"])
 

@@ -414,14 +414,18 @@ def test_a_gain_of_a_custom_law_is_set_in_the_law_whatever_its_name_begins_with(
 
 def test_column_of_the_published_gains_is_named_after_their_source():
     paper = scenario.from_tables({"loop": {"mode": "sampled"}})
-    assert gains.published_label(paper) == "published"
+    assert gains.published_label(paper) == "published gains"
     assert (
-        gains.published_label(scenario.replace(paper, loop__period=0.5)) == "published, scaled"
+        gains.published_label(scenario.replace(paper, loop__period=0.5)) == "published gains, scaled"
     )  # a hand-over of a period
     assert (
-        gains.published_label(scenario.replace(paper, spacecraft={"inertia": [0.1, 0.1, 0.1]})) == "published, scaled"
+        gains.published_label(scenario.replace(paper, spacecraft={"inertia": [0.1, 0.1, 0.1]}))
+        == "published gains, scaled"
     )
-    assert gains.published_label(scenario.replace(paper, controller={"kind": "pd"})) == "paper's law"
+    assert (
+        gains.published_label(scenario.replace(paper, controller={"kind": "pd"}))
+        == "published gains, prescribed-time law"
+    )
 
 
 @pytest.mark.parametrize("kind", ["chain", "spacecraft"])

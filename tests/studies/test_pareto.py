@@ -159,7 +159,7 @@ def test_pareto_command_computes_a_torque_front(command, tmp_path, monkeypatch, 
     read = checked(tmp_path / "p")
     assert set(read.charts) == {"front"}
     colours = {series["name"].split(",")[0]: series["marker"]["color"] for series in read.charts["front"]["data"]}
-    assert (colours["front"], colours["published"]) == ("#0072B2", "#D55E00")  # as in figures/front.png
+    assert (colours["front"], colours["published gains"]) == ("#0072B2", "#D55E00")  # as in figures/front.png
     assert all(float(row["rms_window_error"]) > summary["lower_bound"] > 0.0 for row in rows)
     assert "lower bound on the RMS error with these sensors" in told
     drawn = read.charts["front"]["layout"]["shapes"][-1]

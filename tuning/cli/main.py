@@ -299,12 +299,15 @@ def compare(
     device: Device = "cpu",
     common: Common = USUAL,
 ) -> int:
-    """Tune the paper's law and other attitude laws to the same requirements, and compare them on held-out trials.
+    """Tune the prescribed-time law and other attitude laws to the same requirements, and compare them.
 
     After Ctrl-C or a kill, the same command resumes the search.
 
-    Exit status: 0 the tuned law of the paper meets every requirement, whatever the other laws do, 1 it does not, 2
-    configuration error, 130 interrupted.
+    All tuned laws are verified on the same held-out trials. Only the prescribed-time law decides the exit status, even
+    if the scenario has another law.
+
+    Exit status: 0 the tuned prescribed-time law meets every requirement, 1 it does not, 2 configuration error, 130
+    interrupted.
 
     Args:
         law: Custom law, FILE.py:NAME, to include in the comparison; repeat the option for several.

@@ -116,7 +116,7 @@ QUESTIONS = (
         axis_label="peak torque",
         limit="peak_torque",
     ),
-    Question("How much is spent?", (Value("mean effort", "N m s", lambda law: law.effort),), 1),
+    Question("How much effort?", (Value("mean effort", "N m s", lambda law: law.effort),), 1),
     Question("How much does it chatter?", (Value("mean chattering", "N m/s", lambda law: law.chattering),), 1),
     Question(
         "When has it settled?",
@@ -133,7 +133,7 @@ QUESTIONS = (
         "reference.",
     ),
     Question(
-        "What margins are left?",
+        "Which stability margins?",
         tuple(column for name in MARGINS for column in _margin_columns(name)),
         2,
         logarithmic=False,
@@ -149,7 +149,7 @@ QUESTIONS = (
             dataclasses.replace(ERROR, name="as modelled"),
             _error_column("inertia + 10 %", "heavier"),
             _error_column("inertia - 10 %", "lighter"),
-            _error_column("a period later", "later"),
+            _error_column("one more period of delay", "later"),
         ),
         4,
         axis_label="RMS pointing error",
@@ -161,8 +161,8 @@ QUESTIONS = (
 def build(summary: Compare) -> Report:
     """Return the report of a comparison."""
     headline = {
-        "met": "The tuned law of the paper meets every requirement",
-        "not met": "The tuned law of the paper does NOT meet every requirement",
+        "met": "The tuned prescribed-time law meets every requirement",
+        "not met": "The tuned prescribed-time law does NOT meet every requirement",
     }.get(summary.status, "Interrupted: the best result so far")
     sections = [
         Section(question.title, [answer_table(question, summary.laws)])
@@ -170,8 +170,7 @@ def build(summary: Compare) -> Report:
         if _has_answer(question, summary.laws)
     ]
     method = [
-        "the same search tuned all gains of each law; if the scenario has tune.free, the search tuned only these gains "
-        "of the scenario's law",
+        "the same search tuned each law; the section Gains lists the tuned gains of each law",
         f"results on {format_count(summary.trials, 'held-out trial')}, sampled at whole control periods from t = 0 "
         f"({summary.judged_on})",
     ]
@@ -241,7 +240,7 @@ def answer_table(question: Question, laws: dict[str, Law]) -> Table:
     if with_interval:
         head.insert(1, "95 % interval")
     if question.judged:
-        head += [*(f"trials beyond {metric}" for metric in required), "all limits met"]
+        head += [*(f"violations of {metric}" for metric in required), "all limits met"]
     return Table(("", *head), rows)
 
 
@@ -266,8 +265,8 @@ def gain_lines(summary: Compare) -> Iterator[str]:
         gains = list_gains(law.gains, law.gain_units, ".4g")
         bound = "".join(f"; {gain} on its {side} bound" for gain, side in law.at_bound.items())
         scaled = (
-            " of the paper, scaled to this body and period"
-            if (name, summary.published_label) == ("published", "published, scaled")
+            ", scaled to this body and period"
+            if (name, summary.published_label) == ("published", "published gains, scaled")
             else ""
         )
         yield f"{_readable_name(name)}{scaled}: {gains}{bound}"
@@ -283,7 +282,7 @@ def gain_lines(summary: Compare) -> Iterator[str]:
 
 
 def most_accurate_law(laws: dict[str, Law]) -> str:
-    """Return a sentence on the most accurate law that meets every requirement, and on the error of the paper's law."""
+    """Return a sentence on the most accurate law that meets every requirement, and on the prescribed-time law."""
     errors = {
         name: error for name, law in laws.items() if law.met and (error := _to_arcsec(law.window_error)) is not None
     }
@@ -292,9 +291,10 @@ def most_accurate_law(laws: dict[str, Law]) -> str:
     best, own_law = min(errors, key=errors.__getitem__), "prescribed_time"
     comparison = ""
     if own_law in errors and best != own_law:
-        own_error = (
-            f"{errors[own_law] / errors[best]:.3g} times as much" if errors[best] else f"{errors[own_law]:.3g} arcsec"
-        )
+        own_error = f"{errors[own_law]:.3g} arcsec"
+        ratio = format_ratio(errors[own_law] / errors[best]) if errors[best] else None
+        if ratio is not None:
+            own_error = "an equal error" if ratio == "1" else f"{ratio} times this error"
         comparison = f"; {_readable_name(own_law)} has {own_error}"
     return (
         f"{_readable_name(best)} has the smallest RMS pointing error of the laws that meet every requirement, "

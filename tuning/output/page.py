@@ -42,9 +42,9 @@ INPUT_FILES = ("versions.json", store.SUMMARY, "scenario.toml", *TABLES.values()
 PNG_HEADER = b"\x89PNG\r\n\x1a\n"  # first bytes of a PNG file
 # caption of the scenario in a page, by command: whose gains it has
 SCENARIO_NOTES = {
-    "tune": "These are the gains before the search; tuned.toml is the same scenario with the tuned gains.",
-    "pareto": "These are the gains before the search; the table above has the gains of each point.",
-    "compare": "These are the gains before the search; the gains of each law are listed above.",
+    "tune": "These are the gains of the scenario; tuned.toml is the same scenario with the tuned gains.",
+    "pareto": "These are the gains of the scenario; the table above has the gains of each point.",
+    "compare": "These are the gains of the scenario; the gains of each law are listed above.",
 }
 # captions of the figures
 CAPTIONS = {

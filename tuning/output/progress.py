@@ -35,6 +35,7 @@ class Bar:
         self._prints_lines = not quiet and not console.is_terminal
         self._start_time, self._ended = time.monotonic(), threading.Event()
         self._step = "compiling"  # the step in words
+        self._heading = ""  # what the step belongs to, such as the law in a comparison, see `headed`
         self._total, self._done = 0, 0  # work in all, and work done
         self._first_time, self._first_done = self._start_time, 0  # of the report that the rate is measured from
         self._end_time = -math.inf  # estimated time of the monotonic clock at the end of the work
@@ -61,7 +62,9 @@ class Bar:
         """Return the current step with the time left, or the program that it waits for, for a column of `rich`."""
         seconds = self._end_time - time.monotonic()
         left = f", about {f'{seconds:.0f} s' if seconds < 120.0 else f'{seconds / 60.0:.0f} min'} {self.left}"
-        return _compilation_progress() or self._step + (left if seconds >= 1.0 else "")
+        if compilation := _compilation_progress():
+            return self._heading + compilation
+        return self._step + (left if seconds >= 1.0 else "")
 
     def _measure_rate(self, done: int, total: int, *, again: bool = False) -> float:
         """Return how much work is done per second, 0 before it is known, and store when the work will probably end.
@@ -126,6 +129,8 @@ class Progress(Bar):
         best = f": {format_objective(self._objective, value, self._plant)}, {limits}" if value == value else ""
         self._bar.update(self._task, completed=done)
         self._measure_rate(done, total)
+        heading, colon, _ = step.rpartition(": ")
+        self._heading = heading + colon
         self._step = f"{step}{best}{f', {done} of {total}' if total else ''}"
 
 

@@ -27,9 +27,9 @@ HOPELESS = 1.1  # equal to `optimise.HOPELESS`, whose import takes a second: no 
 CONFIDENT = 98  # equal to `confirm.CONFIDENT` in per cent, whose import takes a second
 THEORY = "without noise, disturbance, sampling and actuator dynamics"  # assumptions of `solutions.exact_peak`
 PUBLISHED = {  # the published gains in words, by the heading of their column
-    "published": "the published gains",
-    "published, scaled": "the published gains, scaled to this body and period",
-    "paper's law": "the paper's law with the published gains",
+    "published gains": "the published gains",
+    "published gains, scaled": "the published gains, scaled to this body and period",
+    "published gains, prescribed-time law": "the prescribed-time law with the published gains",
 }
 
 
@@ -57,7 +57,11 @@ def gain_table(summary: Tune) -> Table:
     """Return the table of the gains that differ, and of the results of all of them on the held-out trials."""
     from ptsmc_jax.simulation.gains import base
 
-    groups = {summary.published_label: summary.published, "before": summary.before, "tuned": summary.held_out}
+    groups = {
+        summary.published_label: summary.published,
+        "gains of the scenario": summary.before,
+        "tuned gains": summary.held_out,
+    }
     columns, plant = {name: group for name, group in groups.items() if group is not None}, summary.plant
     quantity, rows = formats.error_name(plant), list[tuple[str, ...]]()
     for gain in dict.fromkeys(name for group in columns.values() for name in group.gains):
@@ -119,7 +123,7 @@ def accuracy_lines(summary: Tune) -> Iterator[str]:
         reason = (
             f"they break {' and '.join(broken_limits)}" if broken_limits else "see tune.bounds and the requirements"
         )
-        yield f"the scenario's own gains are more accurate than the tuned ones; {reason}"
+        yield f"the gains of the scenario are more accurate than the tuned gains; {reason}"
 
 
 def _published_comparison(summary: Tune) -> Iterator[str]:

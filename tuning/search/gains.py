@@ -115,12 +115,12 @@ def published_scenario(scenario: Scenario) -> Scenario:
 def published_label(scenario: Scenario) -> str:
     """Return the label of the published gains in tables.
 
-    The label reports whether the gains are unchanged, scaled to another body or period, or belong to another law.
+    The label says whether the gains are unchanged, scaled to another body or period, or belong to another law.
     """
     if not scenario.controller.law.prescribed:
-        return "paper's law"
+        return "published gains, prescribed-time law"
     unchanged = mission.is_published_case(scenario) and published_gains(scenario)["delta"] == PUBLISHED_DELTA
-    return "published" if unchanged else "published, scaled"
+    return "published gains" if unchanged else "published gains, scaled"
 
 
 def controls_differ(one: Scenario, other: Scenario) -> bool:

@@ -34,6 +34,7 @@ from tuning.search.progress import Report, headed
 from tuning.studies import judging, stability, tuner
 
 OURS, PUBLISHED = "prescribed_time", "published"  # the prescribed-time law with tuned gains, and with published gains
+PUBLISHED_LABEL = "published gains"  # name of `PUBLISHED` in figures and texts
 INERTIA_ERROR = 0.1  # relative difference between the true inertia and the design model
 MODEL_ERRORS = ("heavier", "lighter", "later")
 # keys of `tune` that are the same for every law
@@ -393,7 +394,7 @@ def _warnings_by_law(results: Mapping[str, Contender]) -> list[str]:
     for law, contender in results.items():
         texts = plausibility.warnings(contender.simulated, tuned=law != PUBLISHED)
         for text in (*texts, *warn_about_plain_numbers(contender.simulated)):
-            laws_by_text.setdefault(text, []).append("published gains" if law == PUBLISHED else law)
+            laws_by_text.setdefault(text, []).append(PUBLISHED_LABEL if law == PUBLISHED else law)
     return [text if len(laws) == len(results) else f"{', '.join(laws)}: {text}" for text, laws in laws_by_text.items()]
 
 
@@ -451,7 +452,10 @@ def plot_figures(comparison: Comparison) -> Iterator[tuple[str, Figure]]:
     """Yield the figures of a comparison with their names."""
     ours = comparison.contenders[OURS]
     # the tuned law is first, as in the figures of `tune`, and has the same colour there
-    trials_by_law = {law: contender.trials for law, contender in {OURS: ours, **comparison.contenders}.items()}
+    trials_by_law = {
+        PUBLISHED_LABEL if law == PUBLISHED else law: contender.trials
+        for law, contender in {OURS: ours, **comparison.contenders}.items()
+    }
     t_f = ours.simulated.controller.t_f
     yield "settling", study_plots.settling_by_angle(
         {law: (np.degrees(t.drawn["initial_angle"]), np.where(t.finished, t.metrics.settling_time, np.nan))

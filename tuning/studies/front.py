@@ -117,7 +117,8 @@ class Front:
 
     def labelled(self) -> dict[str, Point]:
         """Return the points of `others` by the labels that tables and figures show."""
-        return {self.published_label if name == "published" else name: point for name, point in self.others.items()}
+        labels = {"published": self.published_label, "before": "gains of the scenario"}
+        return {labels[name]: point for name, point in self.others.items()}
 
     def summary(self) -> dict[str, object]:
         """Return the content of `summary.json`."""

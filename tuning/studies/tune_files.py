@@ -279,8 +279,13 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, "Figure"]:
     }
     limits = {requirement.metric: requirement.limit for requirement in requirements(scenario)}
     torque = style.torque_metric(limits)
+    labels = {
+        "published": gain_names.published_label(scenario),
+        "before": "gains of the scenario",
+        "tuned": "tuned gains",
+    }
     finished_results = {
-        gain_names.published_label(scenario) if name == "published" else name: (
+        labels[name]: (
             trials.metrics.window_error[trials.finished], getattr(trials.metrics, torque)[trials.finished]
         )
         for name, trials in tuning.held_out.items()
