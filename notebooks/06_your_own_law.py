@@ -88,10 +88,10 @@ for name, run in runs.items():
     print(f"{name:9s} {arcsec(run.metrics['window_error']):.6f} arcsec")
 
 # %% [markdown]
-# The next plot has both laws and the published gains of the paper's law. The curves of the two classes coincide.
+# The next plot has both laws, and the prescribed-time law with the published gains. The curves of the two classes coincide.
 
 # %%
-runs["published gains of the paper's law"] = ptsmc.simulate(flight, trial=7)
+runs["published gains"] = ptsmc.simulate(flight, trial=7)
 figure, axes = plt.subplots()
 for width, (name, run) in zip((4.0, 1.5, 1.5), runs.items(), strict=True):
     history = run.to_polars()
