@@ -113,14 +113,15 @@ def verified(count: int) -> Any:
     return tune_report.build(examples.tune(found, verdicts=[verdict]))
 
 
-def conflict(**limits: float | None) -> Iterable[str]:
+def conflict(changes: dict[str, Any] | None = None, /, **limits: float | None) -> Iterable[str]:
     """Return the lines on a search with limits that conflict.
 
-    limits: ratio of the metric to each limit if this limit is ignored and all others are kept, or None.
+    changes: of the summary. limits: ratio of the metric to each limit if this limit is ignored and all others are kept,
+    or None.
     """
     found = {"largest_over_limit": {"peak_torque": 1.12, "gain_margin": 1.119}, "conflict": limits,
              "searched_globally": True}  # fmt: skip
-    return tune_report.search_lines(examples.tune(found, verdicts=[examples.torque(1.1), MARGIN]))
+    return tune_report.search_lines(examples.tune(found, verdicts=[examples.torque(1.1), MARGIN], **(changes or {})))
 
 
 def skipped(reached: float, **changes: Any) -> Iterable[str]:
@@ -256,6 +257,9 @@ TUNINGS: dict[str, Callable[[], Any]] = {
     "a margin may give way": lambda: conflict(gain_margin=1.25),
     "a margin cannot give way": lambda: conflict(gain_margin=2.5),
     "a limit can be met by another": lambda: conflict(peak_torque=0.98),
+    "trials fail besides a conflict": lambda: conflict(
+        {"training": examples.group(trials=48, counts={"ok": 3, "not_converged": 45})}, peak_torque=1.3
+    ),
     "two limits conflict": lambda: conflict(peak_torque=1.3, gain_margin=None),
     "shortest time by theory and simulation": lambda: shortest(20.1234, 20.5, 0.9),
     "no shortest time": lambda: shortest(None, None),

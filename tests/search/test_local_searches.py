@@ -112,7 +112,8 @@ class Conflicting(Evaluator):
             [np.stack(one, axis=1) for one in ((zero - 2.0, along), (zero + 1.0, along), (zero, zero))], axis=1
         )
         f_gradient = np.stack([zero + 1.0, zero], axis=1)
-        return MeasurementWithGradients(normalised, x0, c[:, :, None], x0, f_gradient, by_share[:, :, None])
+        gains = self.bounds.gains(normalised)
+        return MeasurementWithGradients(gains, x0, c[:, :, None], x0, f_gradient, by_share[:, :, None])
 
     measure = measure_with_gradients
 
@@ -138,6 +139,43 @@ def test_a_search_ends_at_the_best_compromise_and_finds_the_limits_that_conflict
         assert found[limit] == (alone if alone is None else pytest.approx(alone, abs=2e-3))
 
 
+class Saturating(Conflicting):
+    """The limit c = 0.6 - x0 / 10, and a limit of 1 that saturates at 1.25 without gradients for x0 > 0.5."""
+
+    def measure_with_gradients(self, problem, normalised):
+        """Return F and the limits with their gradients at normalised gains (points, 2)."""
+        measured = super().measure_with_gradients(problem, normalised)
+        x0, saturated = normalised[:, 0], normalised[:, 0] > 0.5
+        measured.c[:, :2, 0] = np.stack([0.6 - x0 / 10.0, np.where(saturated, 0.25, x0 - 0.4)], axis=1)
+        measured.c_gradient[:, :2, 0, 0] = np.stack([np.full(x0.shape, -0.1), 1.0 - saturated], axis=1)
+        measured.c_gradient[:, :2, 0, 1] = 0.0
+        return measured
+
+    measure = measure_with_gradients
+
+
+def test_a_limit_of_a_conflict_is_found_from_measured_points_if_the_best_point_saturates():
+    evaluate = Saturating(0.0, 0.0, -1.0)
+    some, start = replace(problem(2), names=evaluate.bounds.names), np.array([0.9, 0.3])
+    for scenario_gains, history in ((np.array([1.2, 1.3]), []), (None, [0.2]), (None, [])):
+        run = local_searches.LocalSearches(evaluate, 0.0, 20, np.random.default_rng(0))
+        run.search_locally(some, {0: start})
+        run._scenario_gains = scenario_gains
+        for x0 in history:
+            run._record(1, evaluate.measure(some, np.array([[x0, 0.3]])))
+        alone = run.find_conflicts(some)["peak_torque"]
+        assert alone == (None if scenario_gains is None and not history else pytest.approx(1.56, abs=1e-3))
+
+
+def test_the_other_limits_of_a_conflict_count_without_the_reserve_of_the_search():
+    """The third limit cannot be met with its reserve of 3 %, but without it."""
+    evaluate = Conflicting(1.2, 1.0, 0.02)
+    some = replace(problem(2), names=evaluate.bounds.names)
+    run = local_searches.LocalSearches(evaluate, [0.0, 0.0, 0.03], 60, np.random.default_rng(0))
+    run.search_locally(some, {0: np.array([0.95, 0.8])})
+    assert run.find_conflicts(some) == {"peak_torque": pytest.approx(1.4, abs=1e-3)}
+
+
 @pytest.mark.parametrize(
     ("relaxed", "x0"),
     [
@@ -153,7 +191,7 @@ def test_a_local_search_minimises_the_objective_or_the_violation_of_some_limits(
     best, kept = local_search.Best(start.normalised, 3, 0.0), []
     asked = partial(evaluate.measure_with_gradients, problem(2))
     local_search.search_locally(asked, best, start, 60, kept.append, relaxed=relaxed)
-    np.testing.assert_allclose(kept[-1].gains[0], [x0, 0.3], atol=1e-3)
+    np.testing.assert_allclose(evaluate.bounds.normalise(kept[-1].gains[0]), [x0, 0.3], atol=1e-3)
 
 
 def test_a_search_starts_from_the_best_design_if_that_is_better_than_the_scenarios_gains():
@@ -163,7 +201,7 @@ def test_a_search_starts_from_the_best_design_if_that_is_better_than_the_scenari
     for given, first in ((designs, designs[1]), (designs[::2], scenario_gains), (np.zeros((0, 2)), scenario_gains)):
         run = local_searches.LocalSearches(evaluate, 0.0, 2, np.random.default_rng(0))
         run.begin(some, scenario_gains, given)
-        np.testing.assert_allclose(evaluate.bounds.gains(run.history[0].gains), first, rtol=1e-12)
+        np.testing.assert_allclose(run.history[0].gains, first, rtol=1e-12)
 
 
 class OfDelta(Evaluator):

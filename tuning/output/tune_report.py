@@ -172,8 +172,10 @@ def search_lines(summary: Tune) -> Iterator[str]:
         )
     hopeless = [metric for metric, violation in violated.items() if violation is None or violation > HOPELESS]
     if hopeless and not record.confirmed and any(v.quantile is not None for v in summary.verdicts):
-        names = " and ".join(hopeless)
-        yield f"no requirement on a fraction of the trials was confirmed, because {names} is out of reach"
+        yield (
+            "no requirement on a fraction of the trials was confirmed, because the best gains break "
+            f"{' and '.join(hopeless)} by more than 10 %"
+        )
     if record.hardest is not None:
         yield _describe_worst_case(record.hardest, tuned_for=record.worst_case)
     yield (
@@ -193,7 +195,7 @@ def _conflict_lines(summary: Tune) -> Iterator[str]:
     for metric, ratio_alone in conflict.items():
         verdict = verdicts.get(metric)
         if verdict is None or ratio_alone is None:
-            yield f"no value of {metric} alone resolves the conflict: the other requirements cannot be met either"
+            yield f"the search found no gains that meet all other requirements, even without {metric}"
             continue
         needed = verdict.limit * (2.0 - ratio_alone if verdict.at_least else ratio_alone)
         if ratio_alone <= 1.0:
@@ -203,6 +205,10 @@ def _conflict_lines(summary: Tune) -> Iterator[str]:
         else:
             new, old = quantity(needed, verdict.unit, 4, metric), quantity(verdict.limit, verdict.unit, 6, metric)
             yield f"if {metric} alone gives way, its limit must be {new} instead of {old}"
+    failures = failed_counts(summary.training.counts)
+    if conflict and failures:
+        count = f"{sum(failures.values())} of {summary.training.trials} training trials"
+        yield f"{count} fail with the best compromise, whatever the limits are: {list_counts(failures)}"
     ratios = [ratio for metric in conflict if (ratio := worst[metric]) is not None]
     if len(conflict) > 1 and len(ratios) == len(conflict):
         yield f"if all of them give way together, each must by {100.0 * (max(ratios) - 1.0):.2g} % of its limit"

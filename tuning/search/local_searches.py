@@ -374,7 +374,8 @@ class LocalSearches:
     def find_conflicts(self, problem: Problem) -> dict[str, float | None]:
         """Return each limit that the best point exceeds most, with its smallest ratio if all other limits are kept.
 
-        The ratio is metric / limit. Every other limit is kept to 0.1 %. The ratio is None if that is impossible.
+        The ratio is metric / limit. Every other limit is kept to 0.1 % by every trial. The ratio is None if no such
+        point is found.
         """
         tightened = self.tightened(problem)
         measure = partial(self._evaluate.measure_with_gradients, tightened)
@@ -382,20 +383,33 @@ class LocalSearches:
 
         def find_smallest_ratio(row: int) -> float | None:
             """Return the smallest ratio to its limit that this constraint reaches while the others hold, if any."""
-            others, ratios = np.arange(worst.size) != row, list[tuple[float, float]]()
+            kept = list[float]()
 
-            def record_ratios(measured: MeasurementWithGradients) -> None:
-                row_ratios = largest_ratios(measured.c, 0.0)[0]
-                ratios.append((float(row_ratios[others].max(initial=0.0)), float(row_ratios[row])))
+            def record_if_others_hold(measured: MeasurementWithGradients) -> None:
+                ratios, fails = largest_ratios(measured.c, self._margin)[0], count_failures(measured.c)[0] > 0
+                if not fails and _excess_of_others(ratios, row) <= 10.0 * SLACK:
+                    kept.append(float(ratios[row]))
 
-            best, start = self._new_best(tightened, self.normalised), Start(self.normalised, CAREFUL)
-            search_locally(measure, best, start, self._steps, record_ratios, relaxed=[row])
-            kept = [ratio for largest_other, ratio in ratios if largest_other <= 1.0 + 10.0 * SLACK]
-            margin = float(np.broadcast_to(self._margin, worst.size)[row])
-            return (1.0 - margin) * min(kept) if kept else None
+            for first in self._starts_without_limit(row):
+                best, start = self._new_best(tightened, first), Start(first, CAREFUL)
+                search_locally(measure, best, start, self._steps, record_if_others_hold, relaxed=[row])
+                if kept:
+                    return min(kept)
+            return None
 
         most_exceeded = np.flatnonzero(worst >= 1.0 + (worst.max() - 1.0) * (1.0 - CONFLICTING)).tolist()
         return {problem.rows[row]: find_smallest_ratio(row) for row in most_exceeded}
+
+    def _starts_without_limit(self, row: int) -> list[np.ndarray]:
+        """Return starting points, (gains,), for a search that ignores the limit of this row.
+
+        The best point is the first. The gradients there may not lead to a point that keeps the other limits, such as
+        with saturated wheels. The point of the history that exceeds the other limits least and the scenario's gains
+        follow.
+        """
+        steps = sorted(self.history, key=lambda step: (_excess_of_others(step.worst, row), step.worst[row]))
+        others = [*(step.gains for step in steps[:1]), self._scenario_gains]
+        return [self.normalised, *(self._evaluate.bounds.normalise(gains) for gains in others if gains is not None)]
 
     def _finish(self, problem: Problem) -> None:
         """Improve the best point: other hand-over times, a last local search, and gains reset to the scenario's."""
@@ -530,6 +544,11 @@ class LocalSearches:
 def _relaxed(problem: Problem) -> Sequence[int] | None:
     """Return the indices of the limits whose largest c is minimised; None: F is minimised subject to the limits."""
     return range(len(problem.rows)) if problem.objective == LIMITS else None
+
+
+def _excess_of_others(ratios: np.ndarray, row: int) -> float:
+    """Return how far the largest ratio to a limit, (rows,), exceeds 1, without the ratio of this row; at least 0."""
+    return max(float(np.delete(ratios, row).max(initial=0.0)) - 1.0, 0.0)
 
 
 def _ranked(ends: Mapping[int, Best]) -> list[tuple[int, Best]]:
