@@ -75,8 +75,9 @@ def test_the_time_left_of_a_step_follows_from_the_work_done_so_far(monkeypatch):
         (311.0, "refining", 4, 4),
         (321.0, "judging", 0, 4),
         (325.0, "judging", 2, 4),
+        (326.0, "searching", 1, 4, 2.0),
     ]
-    assert reported(progress.Progress(quiet=True), monkeypatch, *steps) == [
+    assert reported(progress.Progress(quiet=True, objective="effort"), monkeypatch, *steps) == [
         "searching, 0 of 8",
         "searching, 1 of 8",  # the first piece of work may include a compilation
         "searching, 2 of 8, about 3 min left in this step",
@@ -86,6 +87,7 @@ def test_the_time_left_of_a_step_follows_from_the_work_done_so_far(monkeypatch):
         "refining, 4 of 4",
         "judging, 0 of 4",  # another step with as much work
         "judging, 2 of 4, about 4 s left in this step",
+        "searching, 1 of 4: effort 2 N m s, limits met in training",  # the count is not of the limits
     ]
 
 

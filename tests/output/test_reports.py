@@ -32,7 +32,7 @@ from tuning.output import (
     tune_report,
 )
 from tuning.output.report import Report, Table
-from tuning.search import confirm, optimise
+from tuning.search import optimise
 from tuning.studies.front import Front, Point, read
 
 EXPECTED = Path(__file__).with_name("reports.txt")
@@ -698,7 +698,7 @@ def test_driver_without_a_monotonic_influence_has_no_rank_correlation():
 
 
 def test_constants_of_the_tuning_report_equal_those_of_the_search():
-    assert (tune_report.CONFIDENT, tune_report.HOPELESS) == (100 * confirm.CONFIDENT, optimise.HOPELESS)
+    assert tune_report.HOPELESS == optimise.HOPELESS
 
 
 def test_report_states_that_percentages_of_correlated_inputs_overlap():

@@ -469,7 +469,7 @@ def test_required_margins_appear_in_table_csv_file_and_report(eight, tmp_path):
         assert "  gain_margin at least 6 dB: worst of 2 dispersed loops 5.04 dB: NOT met in 1 of 2 loops" in lines
         assert "  gain_margin at least 6 dB: no worst value: NOT met in 1 of 2 loops" in lines
         assert not [line for line in lines if "delay_margin" in line]
-        moved = "  the search moved the default bounds of delta to 0.1 and 4"
+        moved = "  the search moved the bounds of delta, which tune.bounds does not set, to 0.1 and 4"
         assert lines[lines.index("prescribed time: delta 0.5 s") + 1] == moved
         assert lines[-1] == "a trial has settled when its angle stays below 206 arcsec"
     assert "no law meets every requirement" in page.build(tmp_path / "out")

@@ -171,13 +171,13 @@ def heading(name: str, unit: str) -> str:
 
 
 def widened_lines(bounds: Mapping[str, tuple[float, float]]) -> Iterator[str]:
-    """Return lines with the default bounds that a search moved.
+    """Return lines with the bounds that a search moved, which the scenario does not set.
 
     >>> list(widened_lines({"k_p": (0.01, 100.0)}))
-    ['the search moved the default bounds of k_p to 0.01 and 100']
+    ['the search moved the bounds of k_p, which tune.bounds does not set, to 0.01 and 100']
     """
     for gain, (low, high) in bounds.items():
-        yield f"the search moved the default bounds of {gain} to {low:.4g} and {high:.4g}"
+        yield f"the search moved the bounds of {gain}, which tune.bounds does not set, to {low:.4g} and {high:.4g}"
 
 
 def list_gains(gains: Mapping[str, float], units: Mapping[str, str], digits: str) -> str:

@@ -131,7 +131,7 @@ class Progress(Bar):
         self._measure_rate(done, total)
         heading, colon, _ = step.rpartition(": ")
         self._heading = heading + colon
-        self._step = f"{step}{best}{f', {done} of {total}' if total else ''}"
+        self._step = f"{step}{f', {done} of {total}' if total else ''}{best}"
 
 
 class CampaignProgress(Bar):

@@ -24,7 +24,6 @@ from tuning.output.summaries import Entry, Group, Row, Search, Tune
 
 GRADIENT_TOLERANCE = 0.01  # largest relative difference of gradients from finite differences
 HOPELESS = 1.1  # equal to `optimise.HOPELESS`, whose import takes a second: no confirmation above this metric / limit
-CONFIDENT = 98  # equal to `confirm.CONFIDENT` in per cent, whose import takes a second
 THEORY = "without noise, disturbance, sampling and actuator dynamics"  # assumptions of `solutions.exact_peak`
 PUBLISHED = {  # the published gains in words, by the heading of their column
     "published gains": "the published gains",
@@ -140,7 +139,7 @@ def _published_comparison(summary: Tune) -> Iterator[str]:
     inverse_bounds = None if bounds is None else (1.0 / bounds[1], 1.0 / bounds[0])
     spread = format_interval(inverse_bounds, format_ratio)
     broken_limits = summary.broken_by.get("published")
-    caveat = f"; these break {' and '.join(broken_limits)}" if broken_limits else ""
+    caveat = f"; the published gains break {' and '.join(broken_limits)}" if broken_limits else ""
     yield f"less accurate than {published}: {format_ratio(1.0 / accuracy_ratio)} times the error{spread}{caveat}"
 
 
@@ -164,11 +163,10 @@ def search_lines(summary: Tune) -> Iterator[str]:
     yield from _continuation_lines(record)
     for count in record.confirmed:
         most = count["allowed"]
-        needed = "which takes more trials" if most is None else f"so at most {most} trials beyond the limit"
+        allowed = "too few trials to confirm the requirement" if most is None else f"at most {most} allowed"
         yield (
-            f"{count['metric']} {'confirmed' if count['confirmed'] else 'NOT confirmed'} on {count['trials']} other "
-            f"trials, {count['violations']} of them beyond the limit: the held-out trials will meet it with a "
-            f"probability of {percent(count['probability'])} %; a confirmation needs {CONFIDENT} %, {needed}"
+            f"{count['metric']} {'confirmed' if count['confirmed'] else 'NOT confirmed'} before the held-out trials: "
+            f"{count['violations']} of {count['trials']} other trials are beyond the limit, {allowed}"
         )
     hopeless = [metric for metric, violation in violated.items() if violation is None or violation > HOPELESS]
     if hopeless and not record.confirmed and any(v.quantile is not None for v in summary.verdicts):
@@ -179,8 +177,8 @@ def search_lines(summary: Tune) -> Iterator[str]:
     if record.hardest is not None:
         yield _describe_worst_case(record.hardest, tuned_for=record.worst_case)
     yield (
-        f"the search took {record.seconds:.0f} s with compiling, and simulated {record.rollouts} trials, and "
-        f"{record.gradients} with gradients"
+        f"the search took {record.seconds:.0f} s with compiling, not counting earlier interrupted runs; it simulated "
+        f"{record.rollouts} trials, and {record.gradients} with gradients"
     )
     if summary.differential_evolution is not None:
         yield _evolution_comparison(summary.differential_evolution, record)
@@ -249,10 +247,11 @@ def _describe_worst_case(hardest: Row, *, tuned_for: bool) -> str:
             f"fraction of the trials instead, {hardest['metric']} = {{ limit = .., quantile = 0.99 }}"
         )
     ratio_text = "has no value" if hardest["ratio"] is None else f"is {hardest['ratio']:.4g} times its limit"
-    advice = "" if tuned_for or not hardest["breaks_limit"] else "; tune.worst_case = true tunes for it"
+    advice = ""
+    if hardest["breaks_limit"] and not tuned_for:
+        advice = ". This check is additional to the requirements; to tune for it, set tune.worst_case = true"
     fixed = [name.replace("_", " ") for name in hardest["coordinates"] if name not in hardest["moved"]]
-    without = f"{' and '.join([*fixed, 'noise'])} of a random trial"
-    return f"{where}, but with {without}, {hardest['metric']} {ratio_text}{advice}"
+    return f"{where}, {hardest['metric']} {ratio_text}, with random {' and '.join([*fixed, 'noise'])}{advice}"
 
 
 def _evolution_comparison(check: Row, record: Search) -> str:

@@ -175,17 +175,17 @@ def _trust_entry(trust_results: Trust, tuning: Tuning) -> dict[str, object]:
 def _influence_beyond(beyond: BeyondBound | None, bound: float) -> str:
     """Return the results beyond a bound in words."""
     if beyond is None:
-        return f"on its bound {bound:g}; values beyond it were not simulated"
+        return f"values beyond {bound:g} were not simulated"
     if beyond.is_better:
         times = f"{beyond.error_ratio:.3g}"
-        return f"better beyond its bound: {times} times the error at {beyond.value:g}, every requirement kept"
+        return f"{beyond.value:g} beyond it is better, with {times} times the error and every requirement met"
     if beyond.broken is not None:
-        return f"no better beyond its bound: at {beyond.value:g} {beyond.broken}"
+        return f"{beyond.value:g} beyond it is not better ({beyond.broken})"
     if beyond.error_ratio is None:  # no trial reaches its end with the tuned gains, or their error is zero
-        return f"on its bound {bound:g}: every requirement kept at {beyond.value:g}; the errors cannot be compared"
+        return f"{beyond.value:g} beyond it meets every requirement, but the errors cannot be compared"
     times = f"{beyond.error_ratio:.3g}"
     error = "the same error" if times == "1" else f"{times} times the error"
-    return f"no better beyond its bound: {error} at {beyond.value:g}"
+    return f"{beyond.value:g} beyond it is not better, with {error}"
 
 
 def write(folder: Path, scenario: Scenario, tuning: Tuning, figures: bool, identity: Mapping[str, object]) -> None:
