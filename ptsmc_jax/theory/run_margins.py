@@ -232,7 +232,7 @@ def _run_data(parts: Parts, run: linear.NominalRun) -> tuple[Array, History, Sca
 
 
 def margins_at_ends(parts: Parts) -> dict[str, tuple[Margins, float]]:
-    """Return the margins and the spectral radius at the last full period before the "hand_over" and in "hold".
+    """Return the margins and the `controlled_radius` at the last full period before the "hand_over" and in "hold".
 
     If there is no full period before the hand-over, both results are from the hold phase.
     """
@@ -242,4 +242,23 @@ def margins_at_ends(parts: Parts) -> dict[str, tuple[Margins, float]]:
     timed = margins_at(parts, jnp.asarray(time_to_go), run)
     ends = {"hand_over": 0, "hold": -1}
     by_end = {name: jax.tree.map(lambda v, k=k: v[k], (timed.margins, timed.loops)) for name, k in ends.items()}
-    return {name: (values, linear.spectral_radius(loop)) for name, (values, loop) in by_end.items()}
+    return {name: (values, controlled_radius(loop)) for name, (values, loop) in by_end.items()}
+
+
+def controlled_radius(loop: Loop) -> float:
+    """Return the largest modulus of the poles of the closed loop that the controller moves [-].
+
+    The poles of stored wheel momentum and of estimated biases stay at 1, and would hide the distance of all other poles
+    to the stability limit. An unstable pole counts even if the controller does not move it. The result is NaN if the
+    nominal run is not finite.
+
+    Args:
+        loop: the linearised loop.
+    """
+    opening = linear.open_at_input(jax.tree.map(np.asarray, loop), 0.0, np)
+    if not np.all(np.isfinite(opening.closed(1.0))):
+        return float("nan")
+    poles, fixed = (np.linalg.eigvals(opening.closed(gain)) for gain in (1.0, 0.0))
+    moved = np.min(np.abs(poles[:, None] - fixed), axis=1) > margins.CIRCLE_TOLERANCE
+    size = np.abs(poles)
+    return float(size[moved | (size > 1.0 + margins.CIRCLE_TOLERANCE)].max(initial=0.0))

@@ -246,7 +246,7 @@ def test_margins_of_a_pd_law_in_a_map_agree_with_the_closed_form():
         def radius(factor, cell=cell, moved=moved, pushed=pushed):
             return np.abs(np.linalg.eigvals(moved - factor * pushed @ np.array([[cell.x, cell.y]]))).max()
 
-        assert cell.hold_radius == pytest.approx(1.0, abs=1e-9)  # pole of a memory state without input
+        assert cell.hold_radius == pytest.approx(radius(1.0), rel=1e-9)
         factor = 10.0 ** (cell.hold_gain_margin / 20.0)
         assert radius(0.999 * factor) < 1.0 < radius(1.001 * factor)
         assert 0.0 < cell.hold_delay_margin < 10.0

@@ -12,7 +12,7 @@ import pytest
 
 from ptsmc_jax import explore, scenario
 from ptsmc_jax.scenario.errors import ScenarioError
-from ptsmc_jax.theory import limit_cycles, margins, run_margins
+from ptsmc_jax.theory import limit_cycles, linear, margins, run_margins
 from tests.helpers import SHORT, SHORT_CHAIN, refused, short, untuned
 from tests.theory.loops import held
 from tuning.output import margins_report, page, summaries
@@ -219,6 +219,24 @@ def test_margins_at_a_hand_over_in_the_first_period_are_those_of_the_hold_phase(
     assert course.t.size == 1
     assert course.worst()["phase_margin"] == course.hold[1].phase.min()
     assert np.isnan(course.at_sensors.delay).all()  # delay margins are defined at the command only
+
+
+def test_radius_at_the_ends_ignores_states_that_the_controller_cannot_move():
+    """An estimated bias stays at its value: earlier, its pole at 1 hid the stability limit in maps."""
+    loop = jax.tree.map(np.asarray, run_margins.margins_along_run(at_hand_over(0.1).parts).hold[0])
+    expected = run_margins.controlled_radius(loop)
+    assert linear.spectral_radius(loop) == pytest.approx(1.0)
+    assert expected == pytest.approx(np.exp(-0.1), rel=1e-3)  # surface rate 1 1/s, period 0.1 s
+
+    def with_state(pole):
+        a = np.pad(loop.a, (0, 1))
+        a[-1, -1] = pole
+        new, old = (np.pad(v, ((0, 0), (0, 1), (0, 0))) for v in (loop.new, loop.old))
+        command, seen = np.pad(loop.command, ((0, 0), (0, 1))), np.pad(loop.seen, ((0, 1), (0, 0)))
+        return dataclasses.replace(loop, a=a, new=new, old=old, command=command, seen=seen)
+
+    for pole, radius in ((1.0, expected), (0.9999, expected), (1.01, 1.01)):
+        assert run_margins.controlled_radius(with_state(pole)) == pytest.approx(radius, rel=1e-9)
 
 
 LIMITED = {
