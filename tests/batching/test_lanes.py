@@ -201,10 +201,10 @@ CONTRACTIONS: dict[str, tuple] = {
 }  # fmt: skip
 
 
-def rotating(x, m, length=7, **options):
-    """Multiply a vector by a matrix in each step of a scan; return the last vector and the outputs of all steps.
+def scanned(x, m, length=7, **options):
+    """Scan x -> tanh(m x) + 0.1 k over k = 0 .. length - 1.
 
-    The outputs are the vector, its first component and the number of the step.
+    Return the last x, and x, x[0] and k before each step. options: of `scan`.
     """
     return scan(lambda x, k: (jnp.tanh(m @ x) + 0.1 * k, (x, x[0], k)), x, jnp.arange(length), **options)
 
@@ -320,10 +320,10 @@ LOOPS: dict[str, tuple] = {
     "value used in a loop and after": (made_used_in_a_loop_and_after, X, Y),
     "argument used in two loops": (used_in_two_loops, X, M),
     "argument used in an inner loop and after": (used_in_an_inner_loop_and_after, X, M),
-    "scan": (rotating, X, M),
-    "scan backwards": (partial(rotating, reverse=True), X, M),
-    "scan unrolled": (partial(rotating, unroll=3), X, M),
-    "scan of length 0": (partial(rotating, length=0), X, M),
+    "scan": (scanned, X, M),
+    "scan backwards": (partial(scanned, reverse=True), X, M),
+    "scan unrolled": (partial(scanned, unroll=3), X, M),
+    "scan of length 0": (partial(scanned, length=0), X, M),
     "scan over rows": (scans_of_rows, X, {"a": draw(6, 3), "b": draw(6)}),
     "scan over rows backwards": (lambda r: scan(lambda c, y: (c / 2 + y, c), FIXED, r, reverse=True), draw(6, 3)),
     "scan over rows of a table": (lambda x: scan(lambda c, r: (c + r * c, c @ r), x, TABLE.T), X),
@@ -390,7 +390,7 @@ OTHERS: dict[str, tuple] = {
     "grad inside": (lambda x, m: jax.grad(lambda a: jnp.sum(jnp.tanh(m @ a) ** 2))(x), X, M),
     "jacfwd inside": (lambda x: jax.jacfwd(lambda a: jnp.outer(a, jnp.sin(a)))(x), X),
     "hessian inside": (lambda x: jax.hessian(lambda a: jnp.prod(jnp.sin(a)))(x), X),
-    "grad of a scan inside": (lambda x, m: jax.grad(lambda a: rotating(a, m)[0].sum())(x), X, M),
+    "grad of a scan inside": (lambda x, m: jax.grad(lambda a: scanned(a, m)[0].sum())(x), X, M),
     "checkpoint": (lambda x: jax.grad(lambda a: jax.checkpoint(lambda b: jnp.sum(jnp.sin(jnp.sin(b))))(a))(x), X),
     "custom_jvp": (lambda x: (cubed(x), jax.jacfwd(cubed)(x), jax.nn.relu(x), jax.nn.softplus(x)), X),
     "custom_vjp": (lambda x: (squared(x), jax.grad(lambda a: squared(a).sum())(x)), X),

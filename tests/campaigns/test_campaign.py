@@ -265,7 +265,10 @@ def test_metrics_that_are_nan_are_null_in_the_rows_in_both_precisions(monkeypatc
     (True, (), [0, 1, 2, 3]), (False, (), [None]), (True, (7, 9), [7, 9]), (False, (7,), [7]),
 ])  # fmt: skip
 def test_lower_bound_of_a_campaign_is_pooled_over_its_first_trials_or_rows(monkeypatch, varies, rows, simulated):
-    """Trial k has the lower bound k + 1. The second simulated trial fails and has no bound."""
+    """It is the RMS of the bounds of trials 0 to 3, of the rows, or of one nominal run if nothing varies.
+
+    Trial k has the lower bound k + 1. The second simulated trial fails and has no bound.
+    """
     seen: list[Any] = []
 
     def fly(ready, seed, trial, *, with_margins):

@@ -27,7 +27,10 @@ def environment():
 
 
 def started(folder, *options, **others):
-    """Start `ptsmc montecarlo` with these options in a folder; return the `Popen`. others: arguments of `Popen`."""
+    """Start `COMMAND` (montecarlo of s.toml in the folder) with further options; return the `Popen`.
+
+    others: arguments of `Popen`.
+    """
     return subprocess.Popen([*PTSMC, *COMMAND, *options], cwd=folder, env=environment(), text=True,
                             stdout=subprocess.PIPE, stderr=subprocess.PIPE, **others)  # fmt: skip
 

@@ -115,7 +115,8 @@ def test_earlier_result_is_found_only_for_the_same_scenario_seed_and_command(tmp
     assert store.read_previous_summary(tmp_path / "none", tables, TOLD) is None
 
 
-def test_unfinished_run_is_found_only_for_the_same_list_of_sensors(tmp_path):
+def test_an_unfinished_run_with_other_sensors_is_refused(tmp_path):
+    """The message names the changed key, or the whole list if its length differs."""
     sensors = [{"kind": "star_tracker", "period": 0.25}, {"kind": "gyro"}]
     tables, folder = {"loop": {"period": 0.125}, "sensors": sensors}, tmp_path / "out"
     store.begin_run(folder, tables, TOLD, fresh=True)
@@ -348,7 +349,7 @@ def test_versions_describe_command_code_and_platform(monkeypatch):
 
 
 def test_unfinished_run_resumes_only_with_the_same_command(tmp_path):
-    """Seed, scenario and versions must be the same, too. The command line may differ.
+    """Another subcommand, seed, scenario or version is refused with the difference; other options are not.
 
     A fresh run replaces journal and summary. A finished run is not resumed.
     """

@@ -311,7 +311,8 @@ def test_campaign_of_another_code_version_is_not_extended(command, simulated, tm
     assert store.read_versions(simulated)["code_checksum"] == store.packages()["code_checksum"]
 
 
-def test_a_shard_does_not_delete_the_rows_of_other_shards(command, tmp_path):
+def test_force_is_refused_for_one_of_several_shards(command, tmp_path):
+    """It would delete the rows of the other shards. Shard 1/1 may use it."""
     options = "--trials", 250, "--seed", 3, "--no-figures", "--quiet", "--out", "one"
     assert command("montecarlo", "s.toml", *options, "--shard", "1/2") == (0, "", "")
     refused(command, tmp_path, "montecarlo", "s.toml", *options, "--shard", "2/2", "--force")

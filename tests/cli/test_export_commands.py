@@ -63,6 +63,7 @@ def test_simulate_runs_the_exported_controller(command, tmp_path, exported):
 
 @needs_compiler
 def test_parameters_of_an_exported_controller_that_differ_from_the_scenario_are_reported(command, tmp_path, exported):
+    """`simulate --controller` runs (status 0) and warns on stderr and in summary.json."""
     (tmp_path / "s.toml").write_text(SHORT_CHAIN.replace("[controller]", "[controller]\neta = 2.9\nk1 = 0.8"))
     status, _, err = command("simulate", "s.toml", "--controller", exported, "--no-figures", "--quiet")
     said = (
@@ -157,7 +158,7 @@ def test_export_refuses_a_folder_with_files(command, tmp_path, exported):
 
 
 @needs_compiler
-def test_simulate_refuses_other_folders_and_controllers_of_other_scenarios(command, tmp_path, exported, monkeypatch):
+def test_simulate_refuses_what_is_no_export_and_controllers_of_other_plants(command, tmp_path, exported, monkeypatch):
     """A continuous loop and a missing C compiler are refused too."""
 
     def said(controller):

@@ -366,7 +366,7 @@ def test_gradients_with_every_device_equal_finite_differences():
         np.testing.assert_allclose(slope, (up - down) / (2 * h[k]), rtol=1e-4)
 
 
-def test_error_is_continuous_where_delta_is_a_multiple_of_the_period():
+def test_window_error_of_a_run_is_continuous_where_delta_is_a_multiple_of_the_period():
     """The run has delay, filter and random walk. A first period of length 0 has no weight."""
     gains = (np.array([3.2, 1.0 + shift, 30.0]) for shift in (-1e-7, 1e-7))
     below, above = (window_error_and_derivative(at, np.eye(3)[1])[0] for at in gains)

@@ -118,11 +118,11 @@ def filtered():
 
 
 def steady():
-    """Return the steady-state covariances (every, 2, 2) of a filter's errors just before each control sample.
+    """Return the steady-state error covariances of a filter (every, 2, 2), and the update of a star tracker reading.
 
-    The errors are attitude [rad] and bias [rad/s]. The function also returns the correction matrix (2, 2) and the noise
-    covariance (2, 2) of a star tracker sample. The iteration has a third state, the gyro noise at the sample, because
-    each gyro sample acts in two periods.
+    Item k is the covariance before control sample k + 1; samples 0, every, ... have a reading. The errors are attitude
+    [rad] and bias [rad/s]. The update is M, N (2, 2): P+ = M P M' + N. The iteration has a third state, the gyro
+    noise at the sample, because each gyro sample acts in two periods.
     """
     h, every, noise, gyro, walk, bandwidth = TRACKED.values()
     k1, k2 = (float(v) for v in attitude_filter.filter_gains(vector(bandwidth), h * every))

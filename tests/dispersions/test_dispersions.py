@@ -78,13 +78,14 @@ def test_random_numbers_are_quantiles_of_their_distribution(name):
     np.testing.assert_allclose(kind.at(vector(c)), 3.0 + 0.1 * QUANTILES[name](c), rtol=1e-13)
 
 
-def parts_at(run, given):
-    """Return the parts of a trial of `run`.
+def parts_at(parts, given):
+    """Return the parts of a trial.
 
-    given: {quantity: (distribution, coordinates)} of each random quantity.
+    parts: the nominal parts. given: {quantity: (distribution, coordinates)}; coordinates: random numbers of the trial,
+    standard normal or uniform in 0 to 1 by `distribution.drawn`.
     """
     coordinates = {name: vector(c) for name, (_, c) in given.items()}
-    return Dispersion({name: kind for name, (kind, _) in given.items()}).at(run, coordinates)
+    return Dispersion({name: kind for name, (kind, _) in given.items()}).at(parts, coordinates)
 
 
 @pytest.mark.parametrize("c", [(0.1, 0.2, 0.0), (0.5, 0.9, 0.3), (0.97, 0.6, 1.0)])

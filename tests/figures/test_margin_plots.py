@@ -52,7 +52,10 @@ def test_times_whose_margins_are_not_judged_are_grey():
 
 
 def test_required_margins_are_drawn():
-    """The gain and phase margins are lines through -1, which the curves must not cross."""
+    """In the Nichols chart gain and phase margins are lines through -180 deg and 0 dB.
+
+    Peak sensitivity and margins over time have a dashed line at the limit.
+    """
     limits = {"gain_margin": 6.0, "phase_margin": 30.0, "delay_margin": 0.2, "peak_sensitivity": 5.0}
     w = np.geomspace(1e-2, 1.0, 50)
     L = 0.1 / (1j * w)[:, None]

@@ -260,8 +260,11 @@ def test_noise_on_the_acceleration_of_the_body_excites_the_flexible_modes_too():
 
 
 @pytest.mark.parametrize(("gate", "coordinate"), [(np.inf, 300.0), (10.0, 2000.0)])
-def test_a_search_from_a_motion_that_overflows_ends_without_an_estimate(gate, coordinate):
-    """The frequency is 3e26 rad/s, or infinite. An earlier version rejected all readings of the second motion."""
+def test_a_local_search_from_parameters_whose_motion_overflows_does_not_converge(gate, coordinate):
+    """The frequency is 3e26 rad/s, or infinite. `find_best` continues from a random start.
+
+    An earlier version rejected all readings of the second motion.
+    """
     problem, log = flexible_body()
     problem = replace(problem, model=replace(problem.model, hidden_sigma=1e-3 * jnp.ones(4)))
     search = estimation.Search(problem, [log], gate, lambda text: None)

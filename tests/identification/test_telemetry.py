@@ -279,7 +279,7 @@ def test_torques_that_compensate_a_disturbance_are_accepted():
         ({"attitud": ["a"]}, "telemetry.attitud is not a known key"),
     ],
 )
-def test_a_contradictory_telemetry_table_is_a_configuration_error(table, words):
+def test_an_invalid_telemetry_table_is_a_configuration_error(table, words):
     with pytest.raises(ScenarioError, match=words.replace("[", r"\[")):
         scenario.from_tables({"loop": {"mode": "sampled"}, "wheels": {"kind": "axes"}, "telemetry": table})
 

@@ -198,10 +198,10 @@ def test_s_of_a_second_order_system_with_constant_gain_is_exact_after_a_period(h
 
 
 @pytest.mark.parametrize("clock", short(["anchored", "flight"], ["flight"]))
-def test_simulated_loop_is_stable_beyond_the_stability_limit_of_explicit_sampling(clock):
+def test_implicit_loop_is_stable_beyond_the_stability_limit_of_explicit_sampling(clock):
     """eta = 4 and delta is one period; explicit sampling needs 2.5 or 3.5 periods.
 
-    Poles are from the linearised loop.
+    The poles of the loop linearised along a run equal the closed form. Explicit sampling is unstable.
     """
     radius = {}
     for sampling in ("explicit", "implicit"):

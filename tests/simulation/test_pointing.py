@@ -85,7 +85,11 @@ def relative_share(t, error, mean_of, begins, window, t_end, limits) -> Any:
 
 @programs.jit(static_argnames="segments")
 def tallied(nodes, error, rate, begins, window, limits, segments=33):
-    """Return the tally of pointing indices of errors (n, 5) with their rates at nodes (n,) [s]."""
+    """Return the tally of pointing indices of errors (n, 5) with their rates at nodes (n,) [s].
+
+    begins: start of the observation [s]. window: length of a window [s]. limits (3, 4): of error, mean and relative
+    error, by axis and half-cone [rad]. segments: see `pointing.begin`; too few for a window give NaN.
+    """
 
     def step(tally, row):
         t, t_next, start, start_rate, end, end_rate = row

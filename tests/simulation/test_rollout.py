@@ -178,6 +178,7 @@ def test_the_last_row_of_a_history_has_the_estimate_and_s_of_a_sample_at_t_end(k
 
 @pytest.mark.parametrize("flight", [False, True])
 def test_metrics_at_a_t_f_between_two_samples_use_the_motion_at_t_f(flight):
+    """`terminal_error` equals that of an independent integration from the last sample to t_f."""
     body = with_controller(at_20_hz(20.0, 3.0, 0.53), t_f=vector(20.02))  # t_f = t_s + 10.6 periods
     run = chain_flight() if flight else body
     t_f = float(run.controller.t_f)
