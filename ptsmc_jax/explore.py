@@ -151,7 +151,7 @@ class Identified(estimation.Identification):
 
     @property
     def verdict(self) -> list[str]:
-        """Whether the model explains the logs, and which combinations of parameters are not determined, in words."""
+        """Sentences on whether the model explains the logs, and on combinations of parameters that they leave open."""
         return results.verdict(self)
 
     def plot(self, *names: str) -> "Figures":

@@ -122,7 +122,7 @@ def in_si(unit: str) -> float:
 
 
 def _parse_factor(factor: str) -> tuple[Decimal, dict[str, float]] | None:
-    """Return value and powers of a symbol with its prefix, its power or a square root."""
+    """Return value and powers of a symbol with its prefix, its power or a square root; None if it is not known."""
     match = re.fullmatch(r"(sqrt\()?([A-Za-z]+)(?(1)\)|(?:\^(-?\d(?:\.5)?))?)", factor)
     if match is None:
         return None

@@ -369,7 +369,10 @@ class _Interpreter:
         return lax.fori_loop(np.int32(0), np.int32(length), step, self.align(init, varies))
 
     def cond(self, branches: Sequence, values: list[BatchedArray]) -> list[BatchedArray]:
-        """Return the results of a branch. If trials differ in the index, all branches are evaluated."""
+        """Return the results of the branch that the first value selects; the other values are its operands.
+
+        If trials differ in the index, all branches are evaluated.
+        """
         (index,), operands = values[0].components.reshape(1), values[1:]
         varies = dependence.branch_dependence(branches, np.ndim(index) > 0, _vary_by_trial(operands))
         cases = [lambda branch=branch: self.align(self.evaluate(branch, operands), varies) for branch in branches]

@@ -139,7 +139,7 @@ def struct_members(fields: Iterable[Field]) -> str:
 
 
 def _initializer(value: np.ndarray, kind: str) -> str:
-    """Return the C initializer of a number or an array, with braces for each row."""
+    """Return the C initializer of a number or an array, with braces for each row; kind: see `format_constant`."""
     if value.ndim == 0:
         return format_constant(value.item(), kind)
     return "{" + ", ".join(_initializer(row, kind) for row in value) + "}"

@@ -257,7 +257,10 @@ def interpolate_attitude(times: np.ndarray, quaternions: np.ndarray, ends: np.nd
 
 
 def _spline_rates(times: np.ndarray, samples: np.ndarray, ends: np.ndarray | None) -> np.ndarray:
-    """Return the time derivatives (n, 4) [1/s] of the spline at its samples; see `interpolate_attitude`."""
+    """Return the time derivatives (n, 4) [1/s] of the spline at its samples.
+
+    ends: (2, 3) body rates [rad/s] at the first and the last sample, see `interpolate_attitude`.
+    """
     from scipy.interpolate import CubicSpline, KroghInterpolator
 
     if ends is None:

@@ -128,7 +128,10 @@ class _Spectrum(NamedTuple):
 
 
 def _open_loop_spectrum(loop: Loop, open_loop: Callable[[Loop], Opening] = linear.open_at_input) -> _Spectrum:
-    """Return L of a loop that `open_loop` opens; its numbers are meaningless if the loop is not finite."""
+    """Open a loop with `open_loop`, and return its responses on a frequency grid.
+
+    The numbers are meaningless if `finite` of the result is False.
+    """
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(v)) for v in jax.tree.leaves(loop)]))
     loop = jax.tree.map(lambda v: jnp.where(finite, v, jnp.ones_like(v)), loop)
     opening = open_loop(loop)

@@ -204,7 +204,7 @@ def ratio_to_bound(value: float | None, bound: float | None) -> float | None:
 
 
 def format_interval(bounds: tuple[float, float] | None, format_bound: Callable[[float], str]) -> str:
-    """Return a 95 % interval in parentheses, empty for None."""
+    """Return " (95 % interval: LOW to HIGH)" with its leading blank, "" for None."""
     return "" if bounds is None else f" (95 % interval: {format_bound(bounds[0])} to {format_bound(bounds[1])})"
 
 

@@ -96,7 +96,7 @@ class Result:
 
 
 def read(folder: Path) -> Result:
-    """Read a result folder. Raises RefusedError or ScenarioError if it holds no finished result."""
+    """Return the `Result` in a folder; raise RefusedError or ScenarioError if it holds no finished result."""
     if not folder.is_dir():
         raise RefusedError(f"{folder} is no folder; allowed is a folder that a ptsmc command wrote")
     for name in INPUT_FILES:

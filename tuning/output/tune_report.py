@@ -126,7 +126,7 @@ def accuracy_lines(summary: Tune) -> Iterator[str]:
 
 
 def _published_comparison(summary: Tune) -> Iterator[str]:
-    """Return the comparison with the published gains."""
+    """Yield the lines that compare the tuned with the published gains."""
     accuracy_ratio, bounds = summary.accuracy_gain_over_published, summary.accuracy_gain_interval
     published = PUBLISHED[summary.published_label]
     if summary.published_unavailable:

@@ -207,6 +207,8 @@ class LocalSearches:
     def search_locally(self, problem: Problem, starts: Mapping[int, np.ndarray]) -> None:
         """Search locally with half of the steps from each starting point, then with all steps from the best one.
 
+        The result is `best`.
+
         Args:
             problem: the tuning problem.
             starts: (gains,) normalised gains of each starting point, by number of the local search.

@@ -99,7 +99,10 @@ def global_starting_points(evaluate: Evaluator, problem: Problem, count: int, se
 
 
 def find_decisive_gains(measured: MeasurementWithGradients) -> list[int]:
-    """Return the index of the gain that each nearly active limit depends on most. At least two gains stay free."""
+    """Return the indices of decisive gains, at most one for each nearly active limit, the most active limit first.
+
+    It is the gain that the limit depends on most and that is not in the list yet. At least two gains stay free.
+    """
     nearest = measured.c[0].argmax(axis=1)
     decisive: list[int] = []
     for row in np.argsort(-measured.c[0].max(axis=1)):

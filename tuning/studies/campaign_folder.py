@@ -181,7 +181,7 @@ class Folder:
 
     @property
     def software(self) -> Software:
-        """The controller of the simulation: the C code, or the simulated law."""
+        """The `Software` that the simulation runs: the exported C code, or the law in Python."""
         return PYTHON_SOFTWARE if self.computer is None else self.computer.software
 
     @property

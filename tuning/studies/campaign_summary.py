@@ -181,7 +181,7 @@ def _count_controller_samples(folder: Folder, parts: list[rows.Part]) -> dict[st
 
 
 def input_columns(folder: Folder, parts: list[rows.Part]) -> list[str]:
-    """Return the columns with the inputs of the trials: dispersions, and the values of a run table.
+    """Return the names of the columns with the inputs of the trials: dispersions, and the values of a run table.
 
     They are all columns except the results, the trial number and the columns that identify a row's random sample.
     """

@@ -164,7 +164,10 @@ def contenders(scenario: Scenario, rivals: Rivals = Rivals()) -> dict[str, Scena
 
 
 def _has_law(table: Any, law: Mapping[str, str]) -> bool:
-    """Return whether the scenario's law is this law. Custom laws are compared by file and class name."""
+    """Return whether a table [controller] has this law; law: its kind, and its code if it is custom.
+
+    Custom laws are compared by file and class name.
+    """
     if table.kind != law["kind"] or table.kind != "custom":
         return table.kind == law["kind"]
 
@@ -369,7 +372,7 @@ def summary(comparison: Comparison) -> dict[str, Any]:
 
 
 def warn_about_plain_numbers(scenario: Scenario) -> Iterator[str]:
-    """Warn about numbers of a custom law that are probably gains, but are not declared with `gain` or `number`."""
+    """Yield a warning about numbers of a custom law that may be gains, but are not declared with `gain` or `number`."""
     table = scenario.controller
     fields = dataclasses.fields(table.part_class) if table.kind == "custom" else ()
     names = [

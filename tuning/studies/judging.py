@@ -93,7 +93,7 @@ def _is_served(parts: Parts, problem: Problem) -> bool:
 
 
 def _on_flight_clock(scenario: Scenario, problem: Problem | None, reach: Reach | None = None) -> Study:
-    """Return the scenario ready to simulate on the flight clock, with at least as many samples as the problem.
+    """Return the study of a scenario on the flight clock, with at least as many samples as the problem.
 
     With equal numbers of samples, both use one compiled program.
     """

@@ -129,7 +129,7 @@ def refine_targets(
 
 
 def _refine_gains(setup: posing.TuningSetup, problem: Problem, known_gains: np.ndarray) -> Best | None:
-    """Return the best feasible gains, known ones or those of searches from the most promising known ones."""
+    """Return the best feasible point of known gains and of searches from the best of them; None: there is none."""
     searches = LocalSearches(setup.evaluate, MARGIN, STEPS, np.random.default_rng(0))
     results = setup.evaluate.measure(searches.tightened(problem), known_gains)
     starts = known_gains[np.lexsort((results.f, np.maximum(results.largest_c - NEARLY_FEASIBLE, 0.0)))[:WARM_STARTS]]

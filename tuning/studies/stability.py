@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 def find_margins(scenario: Scenario) -> tuple[Study, Course]:
-    """Return the margins of a scenario along its nominal run.
+    """Return the study of a scenario, and the margins along its nominal run.
 
     Raises ScenarioError if the loop is continuous, if it has no finite derivatives in the hold phase, or if the nominal
     run does not reach its end.

@@ -202,7 +202,8 @@ def _search_and_judge(
 ) -> tuple[_Judged, TuningSetup]:
     """Search for gains, in wider bounds if gains end on default bounds, and judge them on held-out trials.
 
-    If the gains break a limit there that the search kept, search again with more distance from the limits.
+    If the gains break a limit there that the search kept, search again with more distance from the limits. `tries` is
+    the largest number of searches.
 
     Returns:
         The judged gains, and the tuning problem with the bounds of the last search.
