@@ -267,7 +267,7 @@ def test_metrics_that_are_nan_are_null_in_the_rows_in_both_precisions(monkeypatc
 def test_lower_bound_of_a_campaign_is_pooled_over_its_first_trials_or_rows(monkeypatch, varies, rows, simulated):
     """It is the RMS of the bounds of trials 0 to 3, of the rows, or of one nominal run if nothing varies.
 
-    Trial k has the lower bound k + 1. The second simulated trial fails and has no bound.
+    Trial k has the bound k + 1. The second run fails and has none.
     """
     seen: list[Any] = []
 
@@ -288,7 +288,7 @@ def test_lower_bound_of_a_campaign_is_pooled_over_its_first_trials_or_rows(monke
 
 
 @pytest.mark.parametrize("status", ["not_converged", "singular", "diverged"])
-def test_failed_run_is_not_met_even_without_requirements(status):
+def test_a_failed_run_counts_as_not_met_even_without_requirements(status):
     """`ptsmc simulate` then has exit status 1."""
     none: Any = None
     run = runs.Run(none, none, {}, {}, "ok", "", math.nan, [], {}, {})

@@ -111,7 +111,7 @@ def test_cluster_workers_that_failed_or_have_other_versions_are_refused(monkeypa
     assert len(FakeClient.made.cancelled) == 1  # the other futures are cancelled
 
 
-def test_missing_dask_is_reported_with_the_command_to_install_it(monkeypatch):
+def test_a_cluster_without_dask_is_refused_with_the_command_to_install_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(RefusedError, match=r"pip install 'ptsmc-jax\[cluster\]'"):
         cluster.connect("tcp://a:1", {})

@@ -23,7 +23,7 @@ def refused(folder, **options):
 
 @pytest.mark.parametrize("first", [False, True])
 @pytest.mark.parametrize("second", [False, True])
-def test_a_result_folder_has_one_exclusive_writer_or_several_shared_writers(tmp_path, first, second):
+def test_a_second_writer_of_a_result_folder_is_refused_unless_both_share_the_lock(tmp_path, first, second):
     """The same holds for a link to the folder. Afterwards no lock file and no empty folder is left."""
     folder = tmp_path / "new" / "out"
     with store.lock_folder(folder, shared=first):
@@ -59,7 +59,8 @@ with store.lock_folder(folder):
 """
 
 
-def test_the_lock_of_a_killed_process_ends(tmp_path):
+def test_a_folder_is_refused_until_the_process_with_its_lock_is_killed(tmp_path):
+    """The next writer removes the lock file of the killed process. The temporary folder of results remains."""
     environment = dict(os.environ, PYTHONPATH=str(ROOT))
     call = [sys.executable, "-c", HOLDING]
     with subprocess.Popen(call, cwd=tmp_path, env=environment, text=True, stdout=subprocess.PIPE) as process:
@@ -131,7 +132,8 @@ SCENARIO, ASKED = SHORT_CHAIN, ("s.toml", "--quiet", "--no-figures")
     ],
     ids=" ".join,
 )
-def test_commands_do_not_write_into_a_folder_in_use(command, tmp_path, asked):
+def test_commands_refuse_a_result_folder_in_use(command, tmp_path, asked):
+    """They exit with status 2 and write nothing."""
     before = tree(tmp_path)
     with store.lock_folder(tmp_path / "out"):
         code, said, error = command(*asked, "--out", "out")
@@ -141,7 +143,7 @@ def test_commands_do_not_write_into_a_folder_in_use(command, tmp_path, asked):
 
 
 @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="the system has no /proc")
-def test_a_folder_that_cannot_be_written_is_not_reported_as_in_use():
+def test_a_folder_that_cannot_be_written_is_refused_but_not_as_in_use():
     """No file can be created in /proc, although its permissions allow it."""
     with (
         pytest.raises(store.RefusedError, match="nothing may be written into /proc;"),

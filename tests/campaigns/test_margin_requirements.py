@@ -512,8 +512,11 @@ def test_margins_of_a_campaign_are_judged_with_the_trials_that_failed(command, t
         ('{"lower_bound": 1e-6, "margins": [{"metric": "gain_margin"}]}', False),
     ],
 )  # fmt: skip
-def test_campaign_without_its_margin_verdicts_is_unfinished(command, tmp_path, monkeypatch, left, of_loops):
-    """The process may be killed after the last trial, or the file of the verdicts may be damaged."""
+def test_campaign_without_its_margin_verdicts_is_reported_as_incomplete(command, tmp_path, monkeypatch, left, of_loops):
+    """`summarize` then exits with status 1, and the repeated campaign computes the verdicts again.
+
+    The process may be killed after the last trial, or the file of the verdicts may be damaged.
+    """
     tables = {**untuned(SHORT_CHAIN), "requirements": {"peak_torque": 50.0, "gain_margin": 0.1}}
     if not of_loops:
         told = Requirement("gain_margin", 0.1, "dB", at_least=True).verdict(np.asarray(7.0), np.asarray(True))

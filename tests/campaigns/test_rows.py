@@ -35,7 +35,8 @@ def test_part_files_of_a_campaign_are_read_in_the_order_of_their_trials(kept):
 
 
 @pytest.mark.parametrize("harm", ["flip", "cut", "empty", "renamed", "foreign", "longer"])
-def test_damaged_part_file_of_a_campaign_is_detected(kept, harm):
+def test_damaged_part_file_of_a_campaign_is_listed_as_broken(kept, harm):
+    """A file with the name of other trials or the key of another campaign is broken, too."""
     whole, harmed = kept.write(0, frame(0, 50)), kept.write(50, frame(50, 50))
     content = bytearray(harmed.path.read_bytes())
     if harm == "flip":
@@ -93,6 +94,8 @@ def test_file_of_the_user_among_the_part_files_is_not_deleted(kept):
 
 
 def test_part_file_that_does_not_fit_on_the_disk_is_removed(kept, monkeypatch):
+    """The OSError is raised."""
+
     def full(*_):
         raise OSError(28, "No space left on device")
 

@@ -453,7 +453,7 @@ def test_initial_angle_that_contradicts_the_initial_attitude_of_a_run_table_is_r
 
 
 @pytest.mark.parametrize(("angle", "least"), [(0.5, 1e-5), (20.0, 2e-4)])
-def test_tolerance_of_the_initial_angle_allows_rounded_tables(angle, least):
+def test_rounded_initial_angles_of_a_run_table_are_accepted_and_others_refused(angle, least):
     """The tolerance is 1e-5 rad, or 1e-5 relative to a state |x_1| above 1."""
     said, off = np.array([1.0, angle]), np.array([0.0, least])
 

@@ -100,6 +100,7 @@ TOLD = {"command": "tune", "seed": 5}
 
 
 def test_earlier_result_is_found_only_for_the_same_scenario_seed_and_command(tmp_path):
+    """Otherwise `read_previous_summary` returns None."""
     tables, folder = {"controller": {"eta": 3.0, "gain": [1.0, 2.0]}}, tmp_path / "out"
     finished(folder, tables)
     assert store.read_previous_summary(folder, tables, TOLD) == {"status": "met"}
@@ -116,7 +117,7 @@ def test_earlier_result_is_found_only_for_the_same_scenario_seed_and_command(tmp
 
 
 def test_an_unfinished_run_with_other_sensors_is_refused(tmp_path):
-    """The message names the changed key, or the whole list if its length differs."""
+    """The message names the first key with another value."""
     sensors = [{"kind": "star_tracker", "period": 0.25}, {"kind": "gyro"}]
     tables, folder = {"loop": {"period": 0.125}, "sensors": sensors}, tmp_path / "out"
     store.begin_run(folder, tables, TOLD, fresh=True)
@@ -202,7 +203,7 @@ def test_failed_write_of_a_file_keeps_the_existing_file(tmp_path):
     assert tree(tmp_path) == {"a.csv": b"before", "a" * 250: b"as long a name as there is"}
 
 
-def test_names_that_are_not_unicode_are_written_with_escapes(tmp_path):
+def test_file_names_in_a_text_that_are_not_unicode_are_written_with_escapes(tmp_path):
     store.write_text(tmp_path / "a.txt", os.fsdecode(b"gr\xf6\xdfe \xce\xb1"))
     assert (tmp_path / "a.txt").read_text(encoding="utf-8") == "gr\\udcf6\\udcdfe \u03b1"
 
@@ -328,6 +329,7 @@ def finished(folder, tables):
 @pytest.mark.parametrize("name", ["scenario.toml", "versions.json", "summary.json"])
 @pytest.mark.parametrize("content", [None, "", "{", "\x00", "[]", "{}"])
 def test_folder_with_a_missing_or_broken_file_has_no_earlier_result(tmp_path, name, content):
+    """`read_previous_summary` then returns None."""
     tables = {"controller": {"eta": 3.0, "bounds": {"eta": (2.5, 3.5)}}}
     finished(tmp_path / "out", tables)
     assert store.read_previous_summary(tmp_path / "out", tables, TOLD) == {"status": "met"}
@@ -349,7 +351,7 @@ def test_versions_describe_command_code_and_platform(monkeypatch):
 
 
 def test_unfinished_run_resumes_only_with_the_same_command(tmp_path):
-    """Another subcommand, seed, scenario or version is refused with the difference; other options are not.
+    """Another subcommand, seed, scenario or version is refused with the difference. Another command line is accepted.
 
     A fresh run replaces journal and summary. A finished run is not resumed.
     """

@@ -37,7 +37,7 @@ def test_simulate_writes_an_ephemeris_that_is_a_reference_of_another_run(command
         np.testing.assert_allclose(read.reference.initial_reference_attitude(read), found.quaternions[0], atol=1e-12)
 
 
-def test_an_ephemeris_of_a_chain_is_refused(command, tmp_path):
+def test_simulate_refuses_to_write_an_ephemeris_of_a_chain(command, tmp_path):
     (tmp_path / "s.toml").write_text(SHORT_CHAIN)
     assert "--aem" in refused(command, tmp_path, "simulate", "s.toml", "--aem")
 

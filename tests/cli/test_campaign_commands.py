@@ -199,7 +199,7 @@ NO_REQUIREMENTS = SHORT_CHAIN.replace("[requirements]\npeak_torque = 3.0\n", "")
 HALF = SHORT_CHAIN.replace("peak_torque = 3.0", "peak_torque = 0.38")  # about half of the trials keep this limit
 
 
-def test_a_campaign_reports_first_which_requirements_its_trials_cannot_verify(command, tmp_path, monkeypatch):
+def test_a_campaign_warns_first_of_requirements_that_its_trials_cannot_verify(command, tmp_path, monkeypatch):
     limit = "peak_torque = { limit = 3.0, quantile = 0.99, confidence = 0.9 }\neffort = 9.0"
     (tmp_path / "s.toml").write_text(SHORT_CHAIN.replace("peak_torque = 3.0", limit))
     monkeypatch.setattr("tuning.studies.campaign_folder.begin", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
@@ -209,7 +209,7 @@ def test_a_campaign_reports_first_which_requirements_its_trials_cannot_verify(co
     assert "effort" not in few
 
 
-def test_until_confident_needs_requirements(command, tmp_path):
+def test_until_confident_without_requirements_is_refused(command, tmp_path):
     (tmp_path / "s.toml").write_text(NO_REQUIREMENTS)
     assert "needs [requirements]" in refused(command, tmp_path, "montecarlo", "s.toml", "--until-confident", "0.1")
 
@@ -262,7 +262,7 @@ def test_interrupted_until_confident_ends_with_the_same_number_of_trials(command
 
 
 @pytest.mark.parametrize(("made", "said"), [("tune", 1), ("montecarlo", 0)])
-def test_montecarlo_warns_of_the_training_trials_of_tuned_gains(command, tmp_path, made, said):
+def test_montecarlo_warns_if_it_repeats_the_training_trials_of_tuned_gains(command, tmp_path, made, said):
     """`tune --seed 1000` and a default campaign have the same dispersions and noise, which would verify nothing."""
     found = tmp_path / "found"
     found.mkdir()
@@ -303,7 +303,8 @@ def test_shards_in_one_folder_or_several_make_the_whole_campaign(command, simula
         same(rows_of(tmp_path / folder), whole)
 
 
-def test_campaign_of_another_code_version_is_not_extended(command, simulated, tmp_path):
+def test_more_trials_of_a_campaign_of_another_code_version_are_refused(command, simulated, tmp_path):
+    """With --force, the campaign is simulated again."""
     store.write_json(simulated / "versions.json", store.read_versions(simulated) | {"code_checksum": "before"})
     more = "montecarlo", "s.toml", "--trials", 260, "--seed", 3, "--no-figures", "--quiet"
     assert "another version of the source code (checksum before, not " in refused(command, tmp_path, *more)
@@ -335,7 +336,8 @@ def test_damaged_part_of_a_campaign_is_reported_and_simulated_again(command, sim
     assert part.with_name(part.name + ".damaged").exists()  # damaged files are renamed, not deleted
 
 
-def test_a_scenario_that_changed_after_the_campaign_is_reported_as_changed(command, simulated, tmp_path):
+def test_a_campaign_whose_scenario_file_was_changed_is_refused(command, simulated, tmp_path):
+    """A new comment in the file is no change."""
     scenario = simulated / "scenario.toml"
     written = scenario.read_text()
     scenario.write_text(written.replace("\nt_end = ", "\nt_end = 1"))
@@ -372,8 +374,11 @@ def test_worst_lists_trials_that_replay_reproduces(command, simulated, tmp_path)
     assert "known are terminal_error, " in refused(command, tmp_path, "worst", FOLDER, "--by", "xyz")
 
 
-def test_replay_that_differs_from_its_row_is_reported(command, simulated):
-    """The changed row has a valid checksum, as if another version had computed it."""
+def test_replay_that_differs_from_its_row_has_exit_status_1(command, simulated):
+    """The output has the largest relative difference.
+
+    The changed row has a valid checksum, as if another version had computed it.
+    """
     from tuning.studies import campaign_folder
 
     opened = campaign_folder.open_folder(simulated)
@@ -468,7 +473,7 @@ def test_failed_trials_are_counted_with_reason_and_time(command, tmp_path, lost)
     assert set(pl.read_csv(tmp_path / FOLDER / "worst.csv")["status"]) <= {"diverged", "singular"}
 
 
-def test_failed_trial_sets_the_exit_status_without_requirements(command, tmp_path, lost):
+def test_failed_trials_cause_exit_status_1_even_without_requirements(command, tmp_path, lost):
     (tmp_path / "s.toml").write_text(NO_REQUIREMENTS)
     assert command("montecarlo", "s.toml", "--trials", MANY, "--no-figures", "--quiet")[0] == 0
     lost()

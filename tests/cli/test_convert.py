@@ -74,7 +74,7 @@ def test_convert_attitude_accepts_every_representation(command, options, angle):
     assert f"# {angle}\n" in said
 
 
-def test_convert_attitude_reports_gimbal_lock(command):
+def test_convert_attitude_converts_euler_angles_in_gimbal_lock_with_a_note(command):
     code, said, error = command("convert-attitude", "--euler-deg", "10,90,20")
     assert (code, error) == (0, "")
     assert "gimbal lock" in said

@@ -158,7 +158,7 @@ def test_export_refuses_a_folder_with_files(command, tmp_path, exported):
 
 
 @needs_compiler
-def test_simulate_refuses_what_is_no_export_and_controllers_of_other_plants(command, tmp_path, exported, monkeypatch):
+def test_simulate_refuses_a_controller_that_is_no_export_or_of_another_plant(command, tmp_path, exported, monkeypatch):
     """A continuous loop and a missing C compiler are refused too."""
 
     def said(controller):

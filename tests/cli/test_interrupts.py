@@ -137,7 +137,7 @@ def test_search_of_another_code_version_is_shown_with_a_note_and_repeated_with_f
 
 
 @pytest.mark.parametrize("study", ["tune", "pareto", "compare"])
-def test_search_does_not_resume_on_another_device(command, tmp_path, monkeypatch, study):
+def test_an_interrupted_search_is_refused_on_another_device(command, tmp_path, monkeypatch, study):
     """Its journal would contain numbers of a GPU and of a processor."""
 
     def stopped(*_, **__):

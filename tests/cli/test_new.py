@@ -33,7 +33,7 @@ def test_new_writes_the_default_scenario(plant):
     assert len(written) > 4  # with explicit keys
 
 
-def test_schema_command_does_not_overwrite_its_file(command, tmp_path):
+def test_schema_command_refuses_an_existing_file_without_force(command, tmp_path):
     code, said, _ = command("schema")
     assert (code, "anyOf" in json.loads((tmp_path / "scenario.schema.json").read_text())) == (0, True)
     assert "#:schema scenario.schema.json" in said
@@ -41,7 +41,7 @@ def test_schema_command_does_not_overwrite_its_file(command, tmp_path):
     assert command("schema", "--force", "--quiet") == (0, "", "")
 
 
-def test_new_does_not_need_docstrings():
+def test_new_writes_the_same_scenario_without_docstrings():
     """The option -OO of Python removes docstrings."""
     call = [sys.executable, "-OO", "-c", "from tuning.cli import new; print(new.scenario_text('chain', {}), end='')"]
     done = subprocess.run(call, capture_output=True, text=True, cwd=ROOT, check=False)
@@ -153,7 +153,7 @@ def test_commented_keys_of_a_new_scenario_are_valid(plant):
     assert len(every) == others + drawn + attitudes + commands + 1  # 1: [requirements] is not in the layout
 
 
-def test_new_command_does_not_overwrite_files(command, tmp_path):
+def test_new_command_refuses_an_existing_file_without_force(command, tmp_path):
     """With --force, it replaces the file."""
     assert command("new") == (0, "scenario in scenario.toml\n", "")
     written = (tmp_path / "scenario.toml").read_text()
@@ -212,7 +212,7 @@ def test_commented_keys_of_a_new_scenario_have_their_default_values(tmp_path):
         assert parsing.dump(from_tables(given))["observer"]["gain"] == shown
 
 
-def test_examples_are_copied_without_overwriting(command, tmp_path):
+def test_examples_command_copies_the_scenarios_and_refuses_changed_files(command, tmp_path):
     """With --force, changed files are replaced."""
     code, said, _ = command("examples", "mine")
     shipped = {path.name: path.read_text() for path in (ROOT / "scenarios").iterdir() if path.is_file()}

@@ -264,7 +264,7 @@ def test_integration_steps_include_the_momentum_of_the_disturbance():
         ({"wheels": {}, "disturbance": {"kind": "constant", "amplitude": [0.5] * 3}}, r"^disturbance\.amplitude is"),
     ],
 )
-def test_wheel_momentum_that_is_too_large_for_the_control_period_raises_an_error(changes, said):
+def test_wheel_momentum_that_is_too_large_for_the_control_period_is_a_configuration_error(changes, said):
     with pytest.raises(ScenarioError, match=said):
         scenario.study(scenario.from_tables({**CUBESAT, **changes}))
 

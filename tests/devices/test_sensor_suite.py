@@ -220,7 +220,7 @@ def test_a_sensor_suite_without_noise_generates_no_random_numbers():
     assert not any(one.primitive.name == "shift_left" for one in equations(trace))  # every random number needs it
 
 
-def test_a_sensor_without_noise_raises_an_error():
+def test_a_sensor_suite_refuses_a_star_tracker_without_noise():
     tracker = suites.star_tracker(0, H, 0.0, H)
     with pytest.raises(ValueError, match="noise greater than 0"):
         suites.suite([dataclasses.replace(tracker, noise=vector([1e-5, 1e-5, 0.0]))], H)

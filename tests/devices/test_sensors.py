@@ -118,11 +118,11 @@ def filtered():
 
 
 def steady():
-    """Return the steady-state error covariances of a filter (every, 2, 2), and the update of a star tracker reading.
+    """Return the steady-state error covariances P (every, 2, 2), and M, N (2, 2) of a star tracker update.
 
-    Item k is the covariance before control sample k + 1; samples 0, every, ... have a reading. The errors are attitude
-    [rad] and bias [rad/s]. The update is M, N (2, 2): P+ = M P M' + N. The iteration has a third state, the gyro
-    noise at the sample, because each gyro sample acts in two periods.
+    Item k of P is just before control sample k + 1. Samples 0, every, .. have a star tracker reading, which changes P
+    to M P M' + N. The errors are attitude [rad] and bias [rad/s]. The iteration has a third state, the gyro noise at
+    the sample, because each gyro sample acts in two periods.
     """
     h, every, noise, gyro, walk, bandwidth = TRACKED.values()
     k1, k2 = (float(v) for v in attitude_filter.filter_gains(vector(bandwidth), h * every))

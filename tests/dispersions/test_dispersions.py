@@ -79,10 +79,10 @@ def test_random_numbers_are_quantiles_of_their_distribution(name):
 
 
 def parts_at(parts, given):
-    """Return the parts of a trial.
+    """Return the parts of a trial with the nominal parts `parts`.
 
-    parts: the nominal parts. given: {quantity: (distribution, coordinates)}; coordinates: random numbers of the trial,
-    standard normal or uniform in 0 to 1 by `distribution.drawn`.
+    given: {quantity: (distribution, coordinates)}. The coordinates are the random numbers of the trial, standard normal
+    or uniform in 0 to 1 according to `drawn` of the distribution.
     """
     coordinates = {name: vector(c) for name, (_, c) in given.items()}
     return Dispersion({name: kind for name, (kind, _) in given.items()}).at(parts, coordinates)

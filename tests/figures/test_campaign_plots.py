@@ -83,7 +83,7 @@ def test_initial_angles_are_drawn_in_the_unit_of_their_axis(unit, shown, factor)
 
 @pytest.mark.parametrize(("largest", "limit", "unit"), [(1e-4, 2e-4, "arcsec"), (1e-4, 0.1, "deg"), (0.1, 1e-4, "deg")])
 def test_angles_of_a_figure_are_in_arcsec_below_one_degree(largest, limit, unit):
-    """Values and required limit of all angles must be below 1 deg; otherwise all are in deg."""
+    """Values and required limits of all angles must be below 1 deg; otherwise all are in deg."""
     factor = {"deg": 180.0 / np.pi, "arcsec": 180.0 * 3600.0 / np.pi}[unit]
     angles = campaign_plots.Column("rad", np.array([1e-5, largest, np.nan]), limit)
     small, torque = campaign_plots.Column("rad", np.array([1e-9])), campaign_plots.Column("N m", np.array([7.0]))

@@ -52,7 +52,7 @@ def test_times_whose_margins_are_not_judged_are_grey():
 
 
 def test_required_margins_are_drawn():
-    """In the Nichols chart gain and phase margins are lines through -180 deg and 0 dB.
+    """In the Nichols chart the gain and phase margins are lines through -180 deg, 0 dB.
 
     Peak sensitivity and margins over time have a dashed line at the limit.
     """

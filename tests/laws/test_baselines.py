@@ -133,7 +133,7 @@ def test_signed_power_and_its_derivatives_equal_closed_forms():
 
 
 def test_pd_returns_its_sliding_variable_and_has_no_singularity():
-    """At a rotation error of 180 deg its distance to a singularity is 1; that of the sliding laws is 0."""
+    """At a rotation error of 180 deg its singularity distance is 1, and the distance of the sliding laws is 0."""
     law, half = LAWS["pd"], attitude.multiply(TARGET.q, vector([0.0, 0.0, 1.0, 0.0]))
     q_e, w_e, *_ = law.kinematics.relative(X, TARGET)
     s = helpers.commanded(law, T, jnp.asarray(False), X, TARGET, D, vector(0.7))[1]

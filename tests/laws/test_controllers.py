@@ -36,7 +36,7 @@ SPIN = references.Spin(vector(0.1, -0.2, 0.1, np.sqrt(1 - 0.06)), vector(0.02, -
 
 
 def state(seed: int) -> AttitudeState:
-    """Return a random attitude with q4 > 0 and a random body rate of about 0.1 rad/s."""
+    """Return a random attitude with q4 > 0 and a body rate of about 0.1 rad/s."""
     rng = np.random.default_rng(seed)
     q = rng.normal(size=4)
     q[3] = abs(q[3]) + 0.5

@@ -199,9 +199,9 @@ def test_s_of_a_second_order_system_with_constant_gain_is_exact_after_a_period(h
 
 @pytest.mark.parametrize("clock", short(["anchored", "flight"], ["flight"]))
 def test_implicit_loop_is_stable_beyond_the_stability_limit_of_explicit_sampling(clock):
-    """eta = 4 and delta is one period; explicit sampling needs 2.5 or 3.5 periods.
+    """With eta = 4 and delta of one period, explicit sampling is unstable.
 
-    The poles of the loop linearised along a run equal the closed form. Explicit sampling is unstable.
+    The poles of the loop linearised along a run equal the closed form.
     """
     radius = {}
     for sampling in ("explicit", "implicit"):

@@ -158,7 +158,7 @@ class Tabled(ptsmc.AccelerationLaw):
     """PD with a loop that reads a table and fills another table."""
 
     def acceleration(self, now: Any, error: Any, error_rate: Any, bound: Any) -> Any:
-        """Return a PD command from a loop over tables of 600 and 900 numbers, and the error as s."""
+        """Return a PD command plus a small part from a loop that reads 600 and stores 900 numbers, and s, the error."""
         shares = jnp.linspace(0.0, 1e-3, 300), jnp.linspace(1e-3, 0.0, 300)
         end, rows = jax.lax.scan(lambda c, row: (0.99 * c + row[0] * error, c * row[1]), jnp.zeros(3), shares)
         return -error - 2.0 * error_rate + 1e-3 * (end + rows[7] + rows[299]), error
