@@ -487,15 +487,8 @@ def _name_objects(value: object) -> Any:
 def check_names_code(tables: Tables) -> None:
     """Raise ScenarioError if a value was made in Python, such as the class of a custom law."""
     for key, value in _values_by_key(tables).items():
-        if not _is_plain(value):
+        try:
+            json.dumps(value)
+        except TypeError:
             allowed = 'the name of code in a file, such as "parts.py:Name", because a scenario file cannot contain code'
-            raise wrong(key, _name_objects(value), allowed)
-
-
-def _is_plain(value: object) -> bool:
-    """Return whether a value of a table consists of numbers and text only."""
-    if isinstance(value, Mapping):
-        value = list(value.values())
-    if isinstance(value, list | tuple):
-        return all(map(_is_plain, value))
-    return isinstance(value, bool | int | float | str)
+            raise wrong(key, _name_objects(value), allowed) from None

@@ -25,7 +25,8 @@ from ptsmc_jax.numerics import elementary
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 
 Word = UInt32[Array, "..."]
-WholeNumber = int | np.integer | Array  # a negative sample index, or a traced negative number, wraps to 32 bits
+LEAST_SAMPLE = -(2**31)  # smallest number of a sample; a negative one wraps to 32 bits
+WholeNumber = int | np.integer | Array  # a negative number that JAX traces wraps to 32 bits
 
 
 class Key(NamedTuple):
@@ -35,7 +36,7 @@ class Key(NamedTuple):
     b: Array
 
 
-def _to_word(value: WholeNumber, least: int = -(2**31)) -> Array:
+def _to_word(value: WholeNumber, least: int = 0) -> Array:
     """Return a seed, trial or sample of at least `least` as an unsigned 32-bit integer."""
     check_fits("a seed, trial or sample", value, least)
     if isinstance(value, int):
@@ -48,7 +49,7 @@ def _to_word(value: WholeNumber, least: int = -(2**31)) -> Array:
 
 def _to_scalar_word(value: WholeNumber) -> Array:
     """Return a seed or trial as a scalar word. An array is refused: its streams would be mixed sample by sample."""
-    word = _to_word(value, least=0)
+    word = _to_word(value)
     if word.ndim:
         raise ValueError(f"a seed or trial is of shape {word.shape}, but must be one number; use jax.vmap for several")
     return word
@@ -124,7 +125,7 @@ def streams(seed: WholeNumber, trial: WholeNumber, names: Sequence[str]) -> list
         trial: number of the trial [-].
         names: names of the streams.
     """
-    seed, trial = _to_word(seed, least=0), _to_word(trial, least=0)
+    seed, trial = _to_word(seed), _to_word(trial)
     hashes = np.array([_hash_name(name) for name in names], np.uint32)
     keys = jax.lax.map(lambda name_hash: _stream_key(seed, trial, name_hash), hashes)
     return [Key(keys.a[k], keys.b[k]) for k in range(len(names))]
@@ -194,7 +195,7 @@ def uniforms(key: Key, count: int, sample: WholeNumber = 0) -> Float[Array, " {c
     >>> bool((uniforms(key, 3, sample=5) == uniforms(stream(0, 7, "attitude_noise"), 3, sample=5)).all())
     True
     """
-    return _draw("uniform", key, _to_word(sample), count)
+    return _draw("uniform", key, _to_word(sample, LEAST_SAMPLE), count)
 
 
 def normals(key: Key, count: int, sample: WholeNumber = 0) -> Float[Array, " {count}"]:
@@ -205,7 +206,7 @@ def normals(key: Key, count: int, sample: WholeNumber = 0) -> Float[Array, " {co
         count: how many numbers.
         sample: index of the sample; a negative index wraps to 32 bits.
     """
-    return _draw("normal", key, _to_word(sample), count)
+    return _draw("normal", key, _to_word(sample, LEAST_SAMPLE), count)
 
 
 def draw_streams(
@@ -224,7 +225,7 @@ def draw_streams(
     Returns:
         The numbers (count,) [-], by the name of the stream.
     """
-    return _draw_streams(_to_word(seed, least=0), _to_word(trial, least=0), distribution, tuple(counts.items()))
+    return _draw_streams(_to_word(seed), _to_word(trial), distribution, tuple(counts.items()))
 
 
 @partial(jax.jit, static_argnames=("distribution", "counts"))

@@ -2,6 +2,7 @@
 
 import typing
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,11 @@ class Study:
     def catalogue(self) -> dict[str, catalogues.Entry]:
         """The metrics of this scenario's runs, by name."""
         return catalogue(self.scenario)
+
+    @cached_property
+    def missing_derivative(self) -> str | None:
+        """Why the derivatives of a custom law are zero, in words; None: they are not."""
+        return custom_checks.describe_missing_derivative(self.parts, self.scenario)
 
 
 def catalogue(scenario: Scenario) -> dict[str, catalogues.Entry]:
@@ -122,13 +128,11 @@ def study(
     dispersion = build_dispersion(scenario, parts)
     custom_checks.check(parts, dispersion, scenario)
     start_checks.check(scenario, parts, dispersion, dispersed=drawn)
-    margins = margin_requirements(scenario)
-    missing = custom_checks.describe_missing_derivative(parts, scenario) if margins else None
-    if missing is not None:
-        raise ScenarioError(
-            f"requirements.{margins[0].metric}: required margins need the derivative of the law, but {missing}"
-        )
-    return Study(scenario, parts, dispersion, requirements(scenario), margins)
+    ready = Study(scenario, parts, dispersion, requirements(scenario), margin_requirements(scenario))
+    if ready.margins and ready.missing_derivative is not None:
+        metric, missing = ready.margins[0].metric, ready.missing_derivative
+        raise ScenarioError(f"requirements.{metric}: required margins need the derivative of the law, but {missing}")
+    return ready
 
 
 def build_setup(scenario: Scenario) -> Parts:

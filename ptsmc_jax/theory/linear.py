@@ -451,9 +451,16 @@ def delay_one_axis(loop: Loop, z: Array, extra_delay: Scalar, axis: Any) -> Open
 def spectral_radius(loop: Loop, gain: Any = 1.0, extra_delay: float = 0.0) -> float:
     """Return the spectral radius of the closed loop [-].
 
-    The loop is stable below 1. Poles of stored wheel momentum are at 1. The result is NaN if the nominal run is not
-    finite. The function uses NumPy, because the size of the matrix depends on the delay and JAX would compile a program
-    for each size.
+    The loop is stable below 1. Poles of stored wheel momentum are at 1. See `closed_poles` for the arguments.
+    """
+    return float(np.abs(closed_poles(loop, gain, extra_delay)).max())
+
+
+def closed_poles(loop: Loop, gain: Any = 1.0, extra_delay: float = 0.0) -> np.ndarray:
+    """Return the poles (n,) of the closed loop [-], NaN if the nominal run is not finite.
+
+    The function uses NumPy, because the size of the matrix depends on the delay and JAX would compile a program for
+    each size.
 
     Args:
         loop: the linearised loop.
@@ -461,4 +468,4 @@ def spectral_radius(loop: Loop, gain: Any = 1.0, extra_delay: float = 0.0) -> fl
         extra_delay: additional delay of all axes in periods.
     """
     closed = open_at_input(jax.tree.map(np.asarray, loop), extra_delay, np).closed(gain)
-    return float(np.abs(np.linalg.eigvals(closed)).max()) if np.all(np.isfinite(closed)) else float("nan")
+    return np.linalg.eigvals(closed) if np.all(np.isfinite(closed)) else np.full(len(closed), np.nan)

@@ -255,10 +255,7 @@ def controlled_radius(loop: Loop) -> float:
     Args:
         loop: the linearised loop.
     """
-    opening = linear.open_at_input(jax.tree.map(np.asarray, loop), 0.0, np)
-    if not np.all(np.isfinite(opening.closed(1.0))):
-        return float("nan")
-    poles, fixed = (np.linalg.eigvals(opening.closed(gain)) for gain in (1.0, 0.0))
-    moved = np.min(np.abs(poles[:, None] - fixed), axis=1) > margins.CIRCLE_TOLERANCE
-    size = np.abs(poles)
-    return float(size[moved | (size > 1.0 + margins.CIRCLE_TOLERANCE)].max(initial=0.0))
+    poles, without_controller = linear.closed_poles(loop), linear.closed_poles(loop, 0.0)
+    size, tolerance = np.abs(poles), margins.CIRCLE_TOLERANCE
+    stays = np.min(np.abs(poles[:, None] - without_controller), axis=1) <= tolerance
+    return float(size[~stays | (size > 1.0 + tolerance)].max(initial=0.0))

@@ -368,7 +368,7 @@ def test_the_search_converges_if_a_log_hardly_determines_some_moments():
 def test_the_search_converges_if_the_axes_of_all_slews_are_nearly_in_a_plane():
     """The log hardly determines the moment about the normal. An earlier version blamed the model and did not converge.
 
-    Its steps were straight in the coordinates of the inertia, in which the ridge of the likelihood is curved.
+    Its steps were straight in the coordinates of the inertia. The ridge of the likelihood is curved there.
     """
     rng = np.random.default_rng(2)
     axes = (

@@ -185,7 +185,7 @@ class Steepest(LowPass):
 
 
 def test_a_value_that_c_cannot_derive_is_a_parameter_and_the_readme_reports_it():
-    """The README names the operation and the parameters on which the value depends."""
+    """The README names the operation and the parameters that the value depends on."""
     tables = {**FLIGHTS["raw"], "observer": {"kind": "custom", "code": f"{__file__}:Steepest"}}
     made = folder.Controller(scenario.reading.complete(scenario.from_tables(tables)), "flight", "flight")
     names = [field.name for field in made.code.parameters]

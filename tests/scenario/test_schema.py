@@ -141,7 +141,7 @@ def key_of(path):
 
 
 def at_each(wanted, scenarios=BUILT_IN):
-    """Return (tables, path) for each value of each scenario's table for which `wanted(path, value)` is true.
+    """Return (tables, path) of each scenario, for each value of a table with a true `wanted(path, value)`.
 
     scenarios: pairs of the name of a table and the tables of a scenario.
     """

@@ -66,7 +66,7 @@ def close(found, expected, rel):
 
 
 def relative_share(t, error, mean_of, begins, window, t_end, limits) -> Any:
-    """Return the fraction (4,) of the time in whole windows in which the error minus its mean is within limits (4,).
+    """Return the fraction (4,) of the time in whole windows while the error minus its mean is within limits (4,).
 
     Magnitudes are linear between nodes, and the ends of windows count as nodes. The other arguments are those of
     `brute_force`.

@@ -181,7 +181,7 @@ INDEX = "ape_boresight"
 def of_time(interpretation, within, probability=0.9973, confidence=None, ok=None, values=None):
     """Return the verdict on a fraction of time.
 
-    within: fraction of time in which each run keeps the limit. probability, confidence: of the requirement. ok: False
+    within: fraction of the time that each run keeps the limit. probability, confidence: of the requirement. ok: False
     for a failed run. values: the index of each run.
     """
     within = np.asarray(within, dtype=float)

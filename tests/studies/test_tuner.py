@@ -94,7 +94,7 @@ def test_tuning_of_delta_or_t_f_uses_the_anchored_clock(free, anchored):
 
 
 def test_reach_of_a_tuning_covers_the_bounds_and_the_gains_of_the_scenario():
-    """The reach is the range of times and gains for which clock and integration steps are chosen."""
+    """The reach is the range of times and gains. Clock and integration steps are chosen for it."""
     wide = {"eta": [2.1, 9.0], "delta": [0.1, 4.0], "t_f": [20.0, 60.0], "observer_gain": [2.0, 50.0],
             "k1": [0.5, 7.0], "sign_width": [1e-4, 1e-2], "surface_rate": [0.2, 3.0]}  # fmt: skip
     made = scenario.from_tables({"controller": {"sign_width": 1e-3}, "tune": {"free": [*wide], "bounds": wide}})

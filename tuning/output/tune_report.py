@@ -21,6 +21,7 @@ from tuning.output.formats import (
 )
 from tuning.output.report import Report, Section, Table, Text
 from tuning.output.summaries import Entry, Group, Row, Search, Tune
+from tuning.studies.front import LABELS
 
 GRADIENT_TOLERANCE = 0.01  # largest relative difference of gradients from finite differences
 HOPELESS = 1.1  # equal to `optimise.HOPELESS`, whose import takes a second: no confirmation above this metric / limit
@@ -58,8 +59,8 @@ def gain_table(summary: Tune) -> Table:
 
     groups = {
         summary.published_label: summary.published,
-        "gains of the scenario": summary.before,
-        "tuned gains": summary.held_out,
+        LABELS["before"]: summary.before,
+        LABELS["tuned"]: summary.held_out,
     }
     columns, plant = {name: group for name, group in groups.items() if group is not None}, summary.plant
     quantity, rows = formats.error_name(plant), list[tuple[str, ...]]()

@@ -172,6 +172,6 @@ def _read_bounds(bounds: object) -> tuple[np.ndarray, np.ndarray]:
         box = np.asarray(bounds, dtype=float)
     except (TypeError, ValueError):
         box = np.zeros(0)
-    if box.shape != (box.size // 2, 2) or not box.size:
+    if box.shape[1:] != (2,) or not box.size:
         raise TypeError(f"bounds are {bounds!r}, but must be a list with a pair (lower, upper) for each element of x")
     return box[:, 0], box[:, 1]

@@ -260,7 +260,7 @@ def compare(
     references, published_error = judging.reference_scenarios(scenario)
     results, interrupted = {}, False
     if PUBLISHED in references:
-        report("published gains: verifying on held-out trials", 0, 0, np.nan, 0.0)
+        report(f"{PUBLISHED_LABEL}: verifying on held-out trials", 0, 0, np.nan, 0.0)
         simulated = judging.on_flight_clock(references[PUBLISHED])
         trials = judging.judge(simulated, held_out_seed)
         verdicts = judging.verdicts_of(simulated, trials, held_out_seed)

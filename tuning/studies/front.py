@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 
 from ptsmc_jax.simulation.catalogues import CATALOGUES, MARGINS
 
+LABELS = {"before": "gains of the scenario", "tuned": "tuned gains"}  # of sets of gains in tables and figures
+
 
 class Kind(NamedTuple):
     """Names and unit of the traded quantity of a front, for files and texts."""
@@ -117,7 +119,7 @@ class Front:
 
     def labelled(self) -> dict[str, Point]:
         """Return the points of `others` by the labels that tables and figures show."""
-        labels = {"published": self.published_label, "before": "gains of the scenario"}
+        labels = {**LABELS, "published": self.published_label}
         return {labels[name]: point for name, point in self.others.items()}
 
     def summary(self) -> dict[str, object]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from ptsmc_jax.scenario import Study, custom_checks, free_gains, replace, study, tables
+from ptsmc_jax.scenario import Study, free_gains, replace, study, tables
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.scenario.timing import Reach, reach_of
 from ptsmc_jax.simulation.requirements import Requirement
@@ -111,7 +111,7 @@ def set_up_tuning(scenario: Scenario, seed: int, journal: Journal | None = None,
         torque_weight=tune.torque_weight,
     )
     is_discontinuous = scenario.has_discontinuous_sign and "sign_width" not in bounds.names
-    has_derivative = not is_discontinuous and custom_checks.describe_missing_derivative(ready.parts, scenario) is None
+    has_derivative = not is_discontinuous and ready.missing_derivative is None
     if has_derivative:  # start before the margins, so that these programs compile meanwhile
         simulations.prepare(problem.batch, objective.needed_metrics(problem))
     problem = dataclasses.replace(problem, margins=margin_rows.build_required_margins(ready, bounds, seed))

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ptsmc_jax.campaigns import margin_verdicts, store
-from ptsmc_jax.scenario import Study, custom, custom_checks, errors, parsing, study
+from ptsmc_jax.scenario import Study, custom, errors, parsing, study
 from ptsmc_jax.scenario.errors import ScenarioError
 from ptsmc_jax.scenario.tables import Scenario
 from ptsmc_jax.simulation import rollout
@@ -35,9 +35,8 @@ def find_margins(scenario: Scenario) -> tuple[Study, Course]:
     if not scenario.sampled:
         raise ScenarioError(f'margins need the sampled loop, but loop.mode is "{scenario.loop.mode}"')
     ready = study(scenario)
-    missing = custom_checks.describe_missing_derivative(ready.parts, ready.scenario)
-    if missing is not None:
-        raise ScenarioError(f"margins need the derivative of the law, but {missing}")
+    if ready.missing_derivative is not None:
+        raise ScenarioError(f"margins need the derivative of the law, but {ready.missing_derivative}")
     course = run_margins.margins_along_run(ready.parts)
     without_derivatives, code = np.isnan(course.hold[1].peak_sensitivity).any(), rollout.OK
     if course.singularity_distance < rollout.SINGULAR_DISTANCE:
@@ -64,7 +63,7 @@ def worst_margins(ready: Study) -> dict[str, dict[str, Any]] | None:
         and the period of the cycle. The result is None for a continuous loop, for a custom law without a derivative,
         and if the loop has no finite derivatives in the hold phase.
     """
-    if not ready.scenario.sampled or custom_checks.describe_missing_derivative(ready.parts, ready.scenario) is not None:
+    if not ready.scenario.sampled or ready.missing_derivative is not None:
         return None
     sample_margins, hold, limit_cycle = run_margins.judge_run(ready.parts)
     if np.isnan(sample_margins.peak_sensitivity[-1]).any():

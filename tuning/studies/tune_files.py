@@ -17,7 +17,7 @@ from ptsmc_jax.simulation import catalogues
 from tuning.search import custom_parts, trust
 from tuning.search import gains as gain_names
 from tuning.search.local_searches import Step
-from tuning.studies import judging
+from tuning.studies import front, judging
 from tuning.studies.tuner import BeyondBound, Trust, Tuning
 
 if TYPE_CHECKING:
@@ -279,11 +279,7 @@ def figures_of(scenario: Scenario, tuning: Tuning) -> dict[str, "Figure"]:
     }
     limits = {requirement.metric: requirement.limit for requirement in requirements(scenario)}
     torque = style.torque_metric(limits)
-    labels = {
-        "published": gain_names.published_label(scenario),
-        "before": "gains of the scenario",
-        "tuned": "tuned gains",
-    }
+    labels = {**front.LABELS, "published": gain_names.published_label(scenario)}
     finished_results = {
         labels[name]: (
             trials.metrics.window_error[trials.finished], getattr(trials.metrics, torque)[trials.finished]

@@ -353,7 +353,7 @@ def _describe_missing_gradients(setup: TuningSetup) -> str | None:
     if setup.settings.with_gradients:
         cause = custom_checks.describe_infinite_derivative(ready.parts, ready.scenario)
         return "no measured gains have finite gradients" + ("" if cause is None else f"; {cause}")
-    return custom_checks.describe_missing_derivative(ready.parts, ready.scenario)
+    return ready.missing_derivative
 
 
 def _broken_ratios(outcome: Search, verdicts: list[Verdict]) -> dict[str, float]:
