@@ -145,6 +145,12 @@ def test_invalid_axes_of_a_map_are_refused(text):
         mapping.parse_axis(text, "--y", scenario.from_tables({}))
 
 
+@pytest.mark.parametrize("key", ["sensors[0].noise_across", "dispersion.inertia.std", "flexible.coupling[0][0]"])
+def test_keys_that_a_map_cannot_vary_are_refused_with_the_possible_form(key):
+    with pytest.raises(UsageError, match=r"KEY must be TABLE\.KEY or TABLE\.KEY\[0\]"):
+        mapping.parse_axis(f"{key}=1:2:3", "--x", scenario.from_tables({}))
+
+
 def test_error_for_an_invalid_range_of_a_map_names_the_unit_of_its_key():
     with pytest.raises(UsageError, match='in s or with a unit such as "200 ms"'):
         mapping.parse_axis("loop.period=1m:2m:3", "--x", scenario.from_tables({}))

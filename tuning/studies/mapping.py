@@ -104,7 +104,10 @@ def parse_axis(text: str, option: str, scenario: Scenario) -> Axis:
     message = f"{option} is {text}, but must be KEY=LOW:HIGH:COUNT, such as {examples}"
     if re.fullmatch(r"\w+", key):
         message += f"; {parsing.nearest_keys_hint(key, scenario.plant.kind)}"
-    if len(parts) != 3 or not re.fullmatch(r"\w+\.\w+(\[\d+\])?", key):
+    is_possible = re.fullmatch(r"\w+\.\w+(\[\d+\])?", key)
+    if "." in key and not is_possible:
+        message += ". KEY must be TABLE.KEY or TABLE.KEY[0]: a map cannot vary [[sensors]], [dispersion] or matrices"
+    if len(parts) != 3 or not is_possible:
         raise UsageError(message)
     unit = unit_of(scenario, key)
     if unit in units.EXAMPLES:
