@@ -243,7 +243,7 @@ class _Interpreter:
         return [self._align_one(*item) for item in zip(values, axes, strict=True)]
 
     def _align_one(self, value: BatchedArray, axes: int) -> BatchedArray:
-        """Return a value as `align` does, broadcast to the batch shape of `axes`, a sum of TRIAL and DIRECTION."""
+        """Return a value with these batch axes (0, TRIAL, DIRECTION or their sum), broadcast if needed; see `align`."""
         if not axes and value.array is not None:
             return BatchedArray(value.shape, array=value.array, axes=0)
         batch = self.batch_shapes[axes]

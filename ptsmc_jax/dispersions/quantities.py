@@ -178,7 +178,7 @@ def _read_wheel_failure(parts: Parts) -> Numbers:
 
 
 def _with_wheel_failure(parts: Parts, failure: Numbers) -> Parts:
-    """Return the parts with the failure time [s] and the number of the wheel, from 1 (0: none), (2,)."""
+    """Return the parts with a wheel that fails; failure: time [s] and number of the wheel from 1, 0 for none."""
     wheel = jnp.arange(channel_directions(parts).shape[1]).astype(float) + 1.0
     return paths.put(parts, "actuators.failure_times", jnp.where(wheel == failure[1], failure[0], jnp.inf))
 

@@ -242,9 +242,17 @@ class Translator:
     def _results_for_index(
         self, eqn: Any, values: Sequence[np.ndarray], arrays: Sequence[np.ndarray], index: Node | None, k: int
     ) -> np.ndarray:
-        """Return the results of a primitive with indices for the case that the computed index `index` is k.
+        """Return the results of a primitive that reads or writes at indices, for one value of the computed index.
 
-        They are nodes in an object array of the shape of the result.
+        Args:
+            eqn: the primitive.
+            values: its operands.
+            arrays: operands that it reads from.
+            index: the index that C computes at run time; None: all indices are constants.
+            k: the value of this index.
+
+        Returns:
+            Nodes in an object array of the shape of the result.
         """
         if eqn.primitive.name in _INDEXED_ADDITIONS:
             array, indices, addends = values
