@@ -18,7 +18,7 @@ from ptsmc_jax.identification.estimation import Search
 from ptsmc_jax.identification.parameters import Problem
 from ptsmc_jax.identification.telemetry import Measurements
 from ptsmc_jax.scenario import reading
-from ptsmc_jax.scenario.errors import ScenarioError
+from ptsmc_jax.scenario.errors import ScenarioError, show
 from ptsmc_jax.scenario.tables import Scenario
 
 HALF_WAVES = (1, 2, 3, 4, 6, 8)  # numbers of half waves of the sines in the manoeuvre
@@ -73,8 +73,12 @@ def design(
     period, t_f = loaded.loop.period, float(loaded.controller.t_f)
     length = DURATION_IN_TIMES * t_f if duration is None else duration
     largest_rate = RATE_TIMES_TIME / t_f if rate is None else rate
-    if not loaded.sampled or length < 20.0 * period:
-        raise ScenarioError("a design needs the sampled loop and a manoeuvre of at least 20 control periods")
+    if not loaded.sampled:
+        raise ScenarioError(f"loop.mode is {show(loaded.loop.mode)}, but a design needs the sampled loop")
+    if length < 20.0 * period:
+        raise ScenarioError(
+            f"the duration is {length:g} s, but must be at least 20 control periods, {20.0 * period:g} s"
+        )
     t = period * np.arange(round(length / period) + 1)
     shapes = np.stack([np.sin(np.pi * k * t / t[-1]) for k in HALF_WAVES])  # (waves, rows) for unit amplitudes
     log = _log_at_rest(loaded, t)

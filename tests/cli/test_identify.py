@@ -133,6 +133,7 @@ def test_a_design_names_parameters_that_are_known_better_than_the_manoeuvre_can_
         (["run/trajectory.csv", "--design"], "--design needs no log: leave the log files out"),
         (["run/trajectory.csv", "--rate", "0.1"], "--rate is 0.1, but must be absent without --design"),
         (["--design", "--duration", "inf"], 'Invalid value "inf" for --duration. Must be < inf.'),
+        (["--design", "--duration", "1"], "the duration is 1 s, but must be at least 20 control periods, 2 s"),
         (["--design", "--rate", "2 m/s"], "for --rate: 2 m/s is no number in rad/s or with a unit such as"),
         (["absent.csv"], "the log is absent.csv, which does not exist; allowed is a .csv or .parquet file"),
         (["s.toml"], "the log is s.toml, but must be a .csv or .parquet file"),
